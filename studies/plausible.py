@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -122,14 +121,11 @@ class Cell:
             less = Cheapest.load(place)
         else:
             groups = BUDGET.method.groups(recordings)
-            searched = cheapest(
-                recordings, self.controller, found, WANTED_M, groups=groups, checkpoints=place / "search"
-            )
+            searched = cheapest(recordings, self.controller, found, WANTED_M, groups=groups, folder=place)
             if searched is None:
                 print(f"{self.spec}, {self.scenario.name}: {cheapest_in_words(None, WANTED_M)}", flush=True)
                 return
             searched.save(place)
-            shutil.rmtree(place / "search", ignore_errors=True)
             less = searched
         levels = [asdict(level) for level in less.levels]
         yield self._driven(recordings, CHEAPEST, less.pattern, predicted_m=less.predicted_m, levels=levels)

@@ -100,7 +100,7 @@ def test_where_going_on_leads_nowhere_it_searches_afresh_and_goes_on_when_interr
             yield way
 
     monkeypatch.setattr(_Narrowing, "below", in_a_dead_end)
-    asked = {"groups": [RIGHT_GROUP], "objective": GOAL, "checkpoints": tmp_path / "search"}
+    asked = {"groups": [RIGHT_GROUP], "objective": GOAL, "folder": tmp_path}
 
     def interrupt(number, _area_m2):
         if number == 1:
@@ -117,6 +117,8 @@ def test_where_going_on_leads_nowhere_it_searches_afresh_and_goes_on_when_interr
     seen = []
     less = cheapest(road, PullsToBrightPaint(), found, wanted_m, **asked, on_level=lambda *_: seen.append(written()))
     assert kept.items() <= seen[-1].items(), "a search was done twice"
+    less.save(tmp_path)
+    assert not (tmp_path / "search").exists()
     dead, afresh = ways[:2]
     assert dead.predicted_m < wanted_m <= afresh.predicted_m
     at = less.levels.index(afresh)

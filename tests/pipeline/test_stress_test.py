@@ -132,16 +132,16 @@ def test_limits_on_paint_are_told_by_what_each_costs(town, few_pictures, tmp_pat
 def test_limit_costs_in_a_file_that_is_none_are_named(tmp_path):
     one = Unlimited(without="", predicted_m=1.0, predicted_range_m=(0.9, 1.1), conspicuousness=None)
     costs = LimitCosts(searches=(one, dataclasses.replace(one, without="area")))
-    costs.save(tmp_path)
-    assert LimitCosts.load(tmp_path) == costs
-    assert costs.sentences == ("Without the limit on area: predicted 1.00 m, +0.00 m",)
     path = tmp_path / "limits.json"
+    costs.save(path)
+    assert LimitCosts.load(path) == costs
+    assert costs.sentences == ("Without the limit on area: predicted 1.00 m, +0.00 m",)
     content = json.loads(path.read_text())
     content["searches"][1]["driven_m"] = 2.0
     for searches in ([], content["searches"]):
         path.write_text(json.dumps(content | {"searches": searches}))
         with pytest.raises(RoadproofError, match=r"limits\.json .*expected one or more, and all driven or"):
-            LimitCosts.load(tmp_path)
+            LimitCosts.load(path)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ What counts as reached is the least deviation over small errors, so that a drive
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +44,7 @@ MOST_LEVELS = 14
 
 _LOWER, _SMALLEST_STEP = 0.7, 0.9
 _NO_LIMIT_M2 = 1e4
+_SEARCH = "search"
 RUNGS = (Rung(1, 8, 0.03),)
 """What is climbed below each limit of the area."""
 
@@ -91,7 +93,7 @@ class Cheapest:
         return Candidate(self.pattern, self.group, None, self.predicted_m)
 
     def save(self, folder: AnyPath, made_of: object = None) -> None:
-        """Write pattern.json, pattern.png and cheapest.json.
+        """Write pattern.json, pattern.png and cheapest.json, and forget the searches that led there.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -100,6 +102,7 @@ class Cheapest:
         remove(folder / "cheapest.json")
         save_pattern(self.pattern, folder / "pattern.json")
         FILE.write(folder / "cheapest.json", self, made_of=made_of or {})
+        shutil.rmtree(folder / _SEARCH, ignore_errors=True)
 
     @staticmethod
     def load(folder: AnyPath) -> Cheapest:
@@ -131,7 +134,7 @@ def cheapest(
     groups: Sequence[Group],
     objective: Objective | None = None,
     device: torch.device | str = "cpu",
-    checkpoints: Path | None = None,
+    folder: Path | None = None,
     on_level: Callable[[int, float], object] = lambda _level, _area_m2: None,
 ) -> Cheapest | None:
     """The fewest square metres of paint that still take a controller so far aside.
@@ -144,8 +147,8 @@ def cheapest(
         groups: the groups of drives of the search before.
         objective: objective of the search before if it drove in the recorded world; `PathDeviation()` by default.
         device: torch device on which the search computes.
-        checkpoints: folder that keeps every search on the way, so that an interrupted one goes on; whoever gave it
-            removes it when the result is kept. None keeps nothing.
+        folder: folder that the result will be saved to; until it is, every search on the way is kept there, so that an
+            interrupted one goes on. None keeps nothing.
         on_level: called after every limit of the area with the number of limits tried and the least area so far, m².
 
     Returns:
@@ -183,7 +186,7 @@ def cheapest(
         while (fewer := run.without_a_figure()) is not None:
             run, level = fewer, fewer.level()
             levels.append(level)
-        kept = None if checkpoints is None else checkpoints / f"{number}.safetensors"
+        kept = folder and folder / _SEARCH / f"{number}.safetensors"
         before = len(levels)
         for lower in run.below(levels[-1].area_m2 * factor, kept):
             level = lower.level()

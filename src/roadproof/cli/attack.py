@@ -152,7 +152,7 @@ def attack(
     if cheapest is not None:
         found["cheapest"] = _less_paint(drives, attacked, result, cheapest, chosen, goal, device, out / "cheapest")
     if limit_costs:
-        found["limits"] = _limit_costs(drives, attacked, result, chosen, goal, device, out / "limits")
+        found["limits"] = _limit_costs(drives, attacked, result, chosen, goal, device, out)
     answer(found)
 
 
@@ -208,7 +208,7 @@ def _less_paint(
             groups=groups,
             objective=objective,
             device=device,
-            checkpoints=folder / "search",
+            folder=folder,
             on_level=show,
         )
     say(cheapest_in_words(less, wanted_m))
@@ -218,7 +218,6 @@ def _less_paint(
             (folder / name).unlink(missing_ok=True)
         return None
     less.save(folder)
-    shutil.rmtree(folder / "search", ignore_errors=True)
     return stored(folder / "cheapest.json")
 
 
@@ -229,15 +228,16 @@ def _limit_costs(
     groups: Sequence[Group],
     objective: Objective,
     device: str,
-    folder: Path,
+    out: Path,
 ) -> dict[str, Any]:
-    """What each limit on paint costs, which the folder keeps, as its file has it."""
+    """What each limit on paint costs, which the folder of the search keeps, as its file has it."""
     from roadproof.cli.progress import stages
-    from roadproof.pipeline.limit_costs import LimitCosts, search_without
+    from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts, search_without
 
+    file = out / LIMIT_COSTS
     with stages() as show:
         searched = search_without(
-            folder,
+            file.parent,
             drives,
             attacked,
             found,
@@ -247,9 +247,9 @@ def _limit_costs(
             on_step=partial(show, "Searching without limits"),
         )
     costs = LimitCosts.of(found, searched)
-    costs.save(folder)
+    costs.save(file)
     say(*costs.sentences)
-    return stored(folder / "limits.json")
+    return stored(file)
 
 
 def _summarise(result: AttackResult, out: Path) -> None:

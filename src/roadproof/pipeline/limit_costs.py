@@ -19,14 +19,16 @@ from roadproof.attacks import AttackResult, Objective, PathDeviation, kept_attac
 from roadproof.attacks.groups import Group
 from roadproof.controllers import Controller
 from roadproof.errors import PatternError, RoadproofError
-from roadproof.io.files import AnyPath, as_path
-from roadproof.io.records import RecordFile
+from roadproof.io.records import RecordFile, Saved
 from roadproof.paint import Conspicuousness, PaintLimits
 from roadproof.paint.limits import ANY
 from roadproof.pipeline.selection import Selection
 from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
+
+LIMIT_COSTS = "limits/limits.json"
+"""The file of a run with what its limits cost; in its folder lie the searches."""
 
 OnStep: TypeAlias = Callable[[int, int, str], object]
 """Called with the steps done, all of them, and a word on the search."""
@@ -64,7 +66,7 @@ class Unlimited:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class LimitCosts:
+class LimitCosts(Saved):
     """What limits on paint cost an attack. One search each: a cost below zero is chance.
 
     Args:
@@ -117,25 +119,8 @@ class LimitCosts:
             searches=tuple(replace(each, driven_m=m) for each, m in zip(self.searches, metres, strict=True))
         )
 
-    def save(self, folder: AnyPath) -> None:
-        """Write limits.json.
 
-        Raises:
-            OutputError: the folder cannot be written.
-        """
-        FILE.write(as_path(folder) / "limits.json", self)
-
-    @staticmethod
-    def load(folder: AnyPath) -> LimitCosts:
-        """Read what `save` wrote.
-
-        Raises:
-            RoadproofError: the file is missing or damaged.
-        """
-        return FILE.read(as_path(folder) / "limits.json")
-
-
-FILE = RecordFile(
+LimitCosts.FILE = RecordFile(
     kind=LimitCosts,
     name="roadproof-limit-costs",
     error=RoadproofError,

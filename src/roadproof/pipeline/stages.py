@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from roadproof.attacks import AttackResult, Cheapest, Method, cheapest, kept_attack, parse_groups
+from roadproof.attacks import AttackResult, Candidate, Cheapest, Method, cheapest, kept_attack, parse_groups
 from roadproof.attacks.cheapest import FILE, MOST_LEVELS
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import own_objective, variation_of
@@ -27,7 +26,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
 from roadproof.pipeline.film import film_drives
-from roadproof.pipeline.limit_costs import LimitCosts, search_without
+from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts, search_without
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
@@ -40,9 +39,6 @@ from roadproof.simulators.protocol import Simulator, world_of
 
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
-
-LIMIT_COSTS = "limits"
-"""The folder of a run with what limits on paint cost."""
 
 _NONE = "roadproof-cheapest-none", 1
 
@@ -148,18 +144,12 @@ class Stages:
     def select(self, found: AttackResult, drives: Drives) -> Selection:
         """Drive over the strongest candidates once each, and choose one."""
         total, unit = 1 + min(self.budget.select, len(found.candidates)), UNITS[chosen_by(found.candidates)]
-        return select_by_driving(
-            self.simulator,
-            self.controller,
-            self.scenario,
+        return self._drive_over(
             found.candidates,
-            best=self.budget.select,
-            weather=self.budget.recorded_in[0],
-            folder=self.folder / "selection",
-            # The simulator repeats itself, so the recorded clean drive is the one to compare with.
-            clean=drives.drives[0].episode,
-            pool=self.pool,
-            on_drive=lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} {unit}"),
+            self.budget.select,
+            self.folder,
+            drives,
+            lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} {unit}"),
         )
 
     def search_on(self, drives: Drives, recordings: RecordingSet, found: AttackResult, selection: Selection) -> Rounds:
@@ -205,33 +195,27 @@ class Stages:
                 groups=self.groups(recordings),
                 objective=self.budget.objective,
                 device=self.device,
-                checkpoints=folder / "search",
+                folder=folder,
                 on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
             )
             if less is None:
                 write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
                 return None
             less.save(folder, made_of)
-            shutil.rmtree(folder / "search", ignore_errors=True)
-        driven = select_by_driving(
-            self.simulator,
-            self.controller,
-            self.scenario,
+        driven = self._drive_over(
             [less.candidate],
-            best=1,
-            weather=self.budget.recorded_in[0],
-            folder=folder / "selection",
-            clean=drives.drives[0].episode,
-            pool=self.pool,
-            on_drive=lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
+            1,
+            folder,
+            drives,
+            lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
         )
         return less, driven
 
     def limit_costs(self, recordings: RecordingSet, found: AttackResult, drives: Drives) -> tuple[LimitCosts, int]:
         """What each limit on paint costs, predicted and driven once each; and the number of drives made for it."""
-        folder, title = self.folder / LIMIT_COSTS, "Searching without limits"
+        file, title = self.folder / LIMIT_COSTS, "Searching without limits"
         searched = search_without(
-            folder,
+            file.parent,
             recordings,
             self.controller,
             found,
@@ -242,19 +226,9 @@ class Stages:
             on_step=lambda done, total, word: self.on_progress(title, done, total, word),
         )
         patterns = [found.candidates[0], *(each.candidates[0] for each in searched.values())]
-        driven = select_by_driving(
-            self.simulator,
-            self.controller,
-            self.scenario,
-            patterns,
-            best=len(patterns),
-            weather=self.budget.recorded_in[0],
-            folder=folder / "selection",
-            clean=drives.drives[0].episode,
-            pool=self.pool,
-        )
+        driven = self._drive_over(patterns, len(patterns), file.parent, drives)
         costs = LimitCosts.of(found, searched).driven(driven)
-        costs.save(folder)
+        costs.save(file)
         return costs, driven.simulator_calls
 
     def predict(
@@ -316,6 +290,29 @@ class Stages:
             clean=drives.drives[0].episode,
             device=self.device,
             pool=self.pool,
+        )
+
+    def _drive_over(
+        self,
+        candidates: Sequence[Candidate],
+        best: int,
+        place: Path,
+        drives: Drives,
+        on_drive: Callable[[int, float], object] = lambda _done, _effect: None,
+    ) -> Selection:
+        """Drive over the strongest candidates once each (`select_by_driving`); a folder keeps it as its selection."""
+        return select_by_driving(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            candidates,
+            best=best,
+            weather=self.budget.recorded_in[0],
+            folder=place / "selection",
+            # The simulator repeats itself, so the recorded clean drive is the one to compare with.
+            clean=drives.drives[0].episode,
+            pool=self.pool,
+            on_drive=on_drive,
         )
 
     def _folder_of(self, number: int) -> Path:

@@ -38,12 +38,12 @@ from roadproof.limits import check_seed
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.pipeline.fidelity import FIDELITY, Fidelity
-from roadproof.pipeline.limit_costs import LimitCosts, relaxed_limits
+from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts, relaxed_limits
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST, LIMIT_COSTS, OnProgress, Stages, check_paint
+from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_paint
 from roadproof.processes import here_or_beside, require_opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
@@ -107,7 +107,7 @@ class StressTest:
         place, less = folder / "selection", folder / CHEAPEST
         selection = Selection.load(place) if place.is_dir() else None
         prediction, fidelity = folder / "prediction.npz", folder / "evaluation" / FIDELITY
-        limits = folder / LIMIT_COSTS
+        costs = folder / LIMIT_COSTS
         return StressTest(
             attack=AttackResult.load(folder / "attack"),
             selection=selection,
@@ -119,7 +119,7 @@ class StressTest:
             cheapest=(Cheapest.load(less), Selection.load(less / "selection"))
             if (less / "cheapest.json").exists()
             else None,
-            limit_costs=LimitCosts.load(limits) if (limits / "limits.json").exists() else None,
+            limit_costs=LimitCosts.load(costs) if costs.exists() else None,
         )
 
 

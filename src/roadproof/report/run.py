@@ -28,11 +28,11 @@ from roadproof.io.files import bytes_of, check_closed
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
-from roadproof.pipeline.limit_costs import LimitCosts
+from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST, LIMIT_COSTS
+from roadproof.pipeline.stages import CHEAPEST
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.simulators.protocol import PatternImage
 
@@ -171,11 +171,11 @@ def read_run(folder: Path) -> Run:
         pattern=chosen,
         cost=read_cost(folder),
         commands=_commands(folder),
-        cheapest=_cheapest(folder),
+        cheapest=Cheapest.load(path.parent) if (path := _searched(folder, f"{CHEAPEST}/cheapest.json")) else None,
         cheapest_driven=Selection.load(path)
         if ((path := folder / CHEAPEST / "selection") / "selection.json").exists()
         else None,
-        limit_costs=_limit_costs(folder),
+        limit_costs=LimitCosts.load(path) if (path := _searched(folder, LIMIT_COSTS)) else None,
     )
     if run.drives is None and run.recordings is None and run.attack is None and run.judged is None:
         raise RoadproofError(
@@ -190,15 +190,9 @@ def _selections(folder: Path) -> tuple[Selection, ...]:
     return tuple(map(Selection.load, takewhile(lambda place: (place / "selection.json").exists(), chosen)))
 
 
-def _cheapest(folder: Path) -> Cheapest | None:
-    # A search alone leaves it beside its own result.
-    places = (folder / CHEAPEST, folder / "attack" / CHEAPEST)
-    return next((Cheapest.load(place) for place in places if (place / "cheapest.json").exists()), None)
-
-
-def _limit_costs(folder: Path) -> LimitCosts | None:
-    places = (folder / LIMIT_COSTS, folder / "attack" / LIMIT_COSTS)
-    return next((LimitCosts.load(place) for place in places if (place / "limits.json").exists()), None)
+def _searched(folder: Path, file: str) -> Path | None:
+    """A file of a run that a search alone leaves beside its own result; None where it is in neither place."""
+    return next((path for path in (folder / file, folder / "attack" / file) if path.exists()), None)
 
 
 def _commands(folder: Path) -> tuple[str, ...]:
