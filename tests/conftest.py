@@ -87,7 +87,10 @@ def invoke(monkeypatch, capsys):
             main()
         return stopped.value.code or 0, capsys.readouterr()
 
-    return call
+    # A command's Ctrl-C kills the processes beside it; tests that come after in this process interrupt theirs.
+    before = signal.getsignal(signal.SIGINT)
+    yield call
+    signal.signal(signal.SIGINT, before)
 
 
 def pytest_runtest_setup() -> None:
