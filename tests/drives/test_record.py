@@ -203,6 +203,15 @@ def test_it_is_cut_where_the_drive_came_to_harm(drives, town):
     assert along.frame_number[-1] < left.frame_number[2]
 
 
+def test_a_drive_that_ends_on_the_canvas_says_so(drives, town):
+    clean, canvas = drives.drives[0].episode, LEFT.canvas
+    ahead_m = np.array([canvas.ahead_m(x, y) for x, y in zip(clean.x_m.tolist(), clean.y_m.tolist(), strict=True)])
+    until_s = float(clean.time_s[np.abs(ahead_m).argmin()])
+    found = record(town, expert, dataclasses.replace(LEFT, time_limit_s=until_s), **ASKED)
+    assert [each.note for each in drives.drives] == [""] * 3
+    assert [each.note for each in found.drives] == ["ended before the canvas was passed: time limit"] * 3
+
+
 def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_one(town, tmp_path):
     nowhere = dataclasses.replace(LEFT, map_name="nope")
     with pytest.raises(ScenarioError, match="nope"):

@@ -107,7 +107,7 @@ def check_gradients(measure: RecordedMeasure | Beside, space: SearchSpace, searc
 
 
 def check_bounds(space: SearchSpace, search: Search) -> Check:
-    """Check whether the strongest pattern lies on the bounds of the search space."""
+    """Check whether the pattern of the highest value lies on the bounds of the search space."""
     group, restart = divmod(int(search.best.argmax()), search.best.shape[1])
     shape_parameters = search.best_unit[group, restart, :, : len(space.shape_ranges)]
     stuck = float(((shape_parameters == 0) | (shape_parameters == 1)).float().mean())
@@ -115,7 +115,7 @@ def check_bounds(space: SearchSpace, search: Search) -> Check:
     return Check(
         "parameters inside their bounds",
         passed,
-        f"{stuck:.0%} of the winner's shape parameters lie on a bound",
+        f"{stuck:.0%} of the shape parameters lie on a bound, of the pattern of the highest value",
         "" if passed else "the bounds hold the pattern back: widen them, use the free family, or add figures",
     )
 

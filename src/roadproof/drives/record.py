@@ -214,7 +214,7 @@ def _clean(
     notes = [f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas"] if harm else []
     canvas = settings.scenario.canvas
     passed = canvas.ahead_m(float(episode.x_m[-1]), float(episode.y_m[-1])) >= canvas.length_m / 2
-    notes += [] if passed else [f"{episode.ending} before the canvas was passed"]
+    notes += [] if passed else [f"ended before the canvas was passed: {episode.ending}"]
     return _drive(plan, episode, chosen, episode.steer, note="; ".join(notes))
 
 
@@ -232,7 +232,7 @@ def _perturbed(
             chosen = _chosen(film, settings, plan.name)
             right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in chosen[2]])
             notes = [] if tried == 0 else [f"perturbed {share:.2f} times as much as asked, not to crash"]
-            notes += [] if behind_s < math.inf else [f"{episode.ending} before the canvas was passed"]
+            notes += [] if behind_s < math.inf else [f"ended before the canvas was passed: {episode.ending}"]
             return _drive(plan, episode, chosen, answered, right_m, calls=tried + 1, note="; ".join(notes))
     raise RecordingError(
         f"drive {plan.name} of {settings.scenario.name} ends in {harm} before the canvas ends, {TRIES} times; "
