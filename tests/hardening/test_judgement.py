@@ -52,6 +52,16 @@ def test_the_strongest_attack_on_each_street_is_compared():
     assert "0.30 m instead of 1.50 m" in told.sentence
 
 
+def test_an_attack_that_leads_it_out_of_its_lane_by_fewer_metres_is_not_hidden():
+    rows = [each for name in "ab" for each in judged(name, "gradient", [1.5, 1.5], [0.3, 0.3])]
+    ellipses = judged("a", "ellipses", [1.4, 1.4], [0.28, 0.28])
+    ellipses[1] = replace(ellipses[1], left_lane=(True, False))
+    told = Judgement((*rows, *ellipses), (BareDrives(4, 4, ()),) * 2).verdict()
+    assert (told.left_lane_before, told.left_lane_after) == (1.0, 0.25)
+    assert told.after_m == pytest.approx(0.3)
+    assert told.sentence.endswith("it leaves it in 25% of the drives instead of 100%.")
+
+
 def test_hardening_that_spoils_clean_driving_did_not_help():
     told = verdict(*HELPED, clean=(4, 3))
     assert (told.outcome, told.clean_worse) == ("did not help", True)
