@@ -13,7 +13,7 @@ from roadproof.controllers import pilotnet_controller
 from roadproof.errors import ControllerError, TrainingError
 from roadproof.hardening import HardeningBudget, Tuning, TuningBatch, views
 from roadproof.hardening.batches import answers
-from roadproof.hardening.tuning import training_step, tune
+from roadproof.hardening.tuning import require_loss, training_step, tune
 
 TUNING = Tuning(steps=20, repeats=3, batch=16, learning_rate=0.3)
 
@@ -95,6 +95,13 @@ def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_sma
     assert max(training_step(RampNet().eval(), batch).item() for batch in seen) > 0
 
 
+def written_over(model, batch):
+    kept = model.bias.exp()
+    loss = kept.square()
+    kept += 1.0
+    return loss
+
+
 @pytest.mark.parametrize(
     ("step", "error", "message"),
     [
@@ -103,11 +110,18 @@ def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_sma
         (lambda model, batch: model.weight, TrainingError, r"a tensor of shape \(2,\)"),
         (lambda model, batch: torch.tensor(1.0), TrainingError, "with a gradient to the parameters"),
         (lambda model, batch: 1 / 0, ControllerError, "the training step raised ZeroDivisionError at .*test_tuning.py"),
+        (lambda model, batch: (model.bias * 0).sqrt(), TrainingError, "the gradient of the loss is not finite at step"),
+        (lambda model, batch: torch.ones((), requires_grad=True) * 2, TrainingError, "depends on no parameter"),
+        (written_over, ControllerError, "the gradient of the training step raised RuntimeError: .*inplace operation"),
     ],
 )
-def test_training_steps_that_give_no_loss_are_one_line(street, step, error, message):
+def test_training_steps_that_give_no_loss_or_gradient_are_one_line_before_anything_is_driven(
+    street, step, error, message
+):
     with pytest.raises(error, match=message):
         tuned(street, step=step)
+    with pytest.raises(error, match=message):
+        require_loss(step, RampNet(), RampFollower(), size=RampNet.input_size, device="cpu")
 
 
 def test_a_batch_is_learnt_from_again_while_its_patterns_climb(street):

@@ -38,6 +38,7 @@ from roadproof.search_space import SearchSpace
 PEDALS = 0.3
 """What throttle and brake count in the loss, against 1 for steering."""
 
+_CURE = "lower the learning rate, or mend the step"
 
 TrainingStep: TypeAlias = Callable[[nn.Module, TuningBatch], Tensor]
 """The loss of a batch, differentiable in the controller's parameters; one of the user's own, or `training_step`."""
@@ -141,8 +142,8 @@ def tune(
         on_step: called at every tenth step and at the last with the step and the mean loss since the call before.
 
     Raises:
-        TrainingError: the training step gives anything but one finite number with a gradient.
-        ControllerError: a controller or the training step raises, or a controller answers wrongly.
+        TrainingError: the training step gives anything but one finite number with a finite gradient to parameters.
+        ControllerError: a controller, the training step or its gradient raises, or a controller answers wrongly.
     """
     place = torch.device(device)
     lay_out(network.to(place).eval())
@@ -164,12 +165,8 @@ def tune(
             batch = TuningBatch(*(torch.cat(columns) for columns in zip(*painted, strict=True)))
             for group in optimiser.param_groups:
                 group["lr"] = tuning.rate(number * tuning.repeats + again)
-            loss = _loss(step, network, batch, number)
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(parameters, 5.0)
+            total += _differentiate(step, network, parameters, batch, number)
             optimiser.step()
-            total += float(loss.detach())
             shown = [each.climbed(pictures.space, tuning.climb) for each in shown]
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
             if checkpoint is not None:
@@ -229,13 +226,24 @@ def require_loss(
     speed_mps, command = torch.full((4,), 7.0, device=device), torch.full((4,), int(Command.FOLLOW), device=device)
     with torch.no_grad():
         target = answers(teacher, frames, speed_mps, command)
-    _loss(step, network.to(device), TuningBatch(frames, speed_mps, command, target), 0)
+    parameters = [each for each in network.to(device).eval().parameters() if each.requires_grad]
+    _differentiate(step, network, parameters, TuningBatch(frames, speed_mps, command, target), 0)
 
 
-def _loss(step: TrainingStep, network: nn.Module, batch: TuningBatch, number: int) -> Tensor:
-    """The loss of a batch, of the step of this number."""
+def _differentiate(
+    step: TrainingStep, network: nn.Module, parameters: Sequence[nn.Parameter], batch: TuningBatch, number: int
+) -> float:
+    """Give the parameters the gradient of a batch's loss, cut to a norm of 5; the loss, of the step of this number."""
+    for each in parameters:
+        each.grad = None
     with mixed_precision(batch.frames.device):
-        return _checked(call("the training step", step, network, batch), number)
+        loss = _checked(call("the training step", step, network, batch), number)
+    call("the gradient of the training step", torch.autograd.backward, loss)
+    if all(each.grad is None for each in parameters):
+        raise TrainingError(f"the loss depends on no parameter of the controller at step {number + 1}; mend the step")
+    if not bool(nn.utils.clip_grad_norm_(parameters, 5.0).isfinite()):
+        raise TrainingError(f"the gradient of the loss is not finite at step {number + 1}; {_CURE}")
+    return float(loss.detach())
 
 
 def _checked(loss: object, number: int) -> Tensor:
@@ -244,7 +252,5 @@ def _checked(loss: object, number: int) -> Tensor:
         told = f"a tensor of shape {tuple(loss.shape)}" if isinstance(loss, Tensor) else f"a {type(loss).__name__}"
         raise TrainingError(f"the training step gave {told}, expected one number with a gradient to the parameters")
     if not bool(loss.isfinite().all()):
-        raise TrainingError(
-            f"the loss is {loss.item()} at step {number + 1}; lower the learning rate, or mend the step"
-        )
+        raise TrainingError(f"the loss is {loss.item()} at step {number + 1}; {_CURE}")
     return loss.reshape(())
