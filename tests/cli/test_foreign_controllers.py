@@ -101,6 +101,18 @@ def test_debug_shows_the_whole_traceback(here, invoke):
     assert printed.err.splitlines()[-1].startswith("roadproof: bad_drivers:fails raised ZeroDivisionError at ")
 
 
+def test_a_fault_of_ours_does_not_end_as_a_check_that_failed(invoke, monkeypatch):
+    def full(*_, **__):
+        raise MemoryError("no memory left")
+
+    monkeypatch.setattr("roadproof.controllers.load_controller", full)
+    code, printed = invoke("check-controller", "pilotnet")
+    assert (code, printed.out) == (2, "")
+    assert "Traceback (most recent call last)" in printed.err
+    last = printed.err.splitlines()[-1]
+    assert last.startswith("roadproof: MemoryError: no memory left; that is a fault of roadproof, or of this machine")
+
+
 HASTY = "from roadproof import cli, foreign; foreign.NOTICE_S = 0.3; cli.LIMIT_S = 1.0"
 
 

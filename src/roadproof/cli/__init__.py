@@ -2,7 +2,8 @@
 
 Verbs import what they work with when they are called: torch takes seconds, which `--help` and mistakes in the options
 should not. Where a verb is long, its options are many: each is read, checked and handed on. A `RoadproofError` is one
-line on standard error and exit code 2, a traceback only with `--debug`.
+line on standard error and exit code 2, a traceback only with `--debug`; whatever else is raised is a fault of ours, and
+shows both.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from roadproof.cli.study import study
 from roadproof.cli.train import train
 from roadproof.cli.verbs import verb
 from roadproof.errors import RoadproofError
-from roadproof.foreign import LIMIT_S, end_calls_after
+from roadproof.foreign import LIMIT_S, end_calls_after, in_one_line
 from roadproof.io.files import printable
 from roadproof.machine import keep_freed_memory, sleep_while_waiting
 
@@ -141,6 +142,11 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         # The latter while the command is still put together.
         code = _INTERRUPTED
+    except Exception as error:
+        # Python would end with 1, which says of a check that the controller failed.
+        traceback.print_exc()
+        _complain(f"{in_one_line(error)}; that is a fault of roadproof, or of this machine: please report it")
+        code = 2
     if code == _INTERRUPTED:
         _complain("interrupted; give the same command again to go on")
         _end_soon(code)
