@@ -250,3 +250,16 @@ def test_other_recordings_another_vehicle_and_the_same_ones_are_told_apart(recor
     assert RecordedSimulator(darker).identity != known
     heavy = Vehicle.bicycle(wheelbase_m=4.0, steer_range_rad=0.7, dt_s=0.05)
     assert RecordedSimulator(recordings, vehicle=heavy).identity != known
+
+
+def test_another_processor_which_identifies_the_vehicle_to_other_last_digits_drives_in_the_same_world(
+    recordings, monkeypatch
+):
+    known, identified = RecordedSimulator(recordings), Vehicle.identified
+
+    def elsewhere(tracks):
+        found = identified(tracks)
+        return dataclasses.replace(found, slipping=tuple(value * (1 + 1e-12) + 1e-15 for value in found.slipping))
+
+    monkeypatch.setattr(Vehicle, "identified", staticmethod(elsewhere))
+    assert RecordedSimulator(recordings).identity == known.identity

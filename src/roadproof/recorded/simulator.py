@@ -96,14 +96,18 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         device: torch.device | str = "cpu",
     ) -> None:
         self.recordings = recordings
+        self._given = vehicle
         self._world = RecordedWorld(recordings, vehicle=vehicle, device=device)
         super().__init__(recordings.camera, recordings.view, self._world.course.dt_s)
         self._weather = light_of(recordings.recordings[0].weather) if weather is None else Weather(weather)
 
     @cached_property
     def identity(self) -> str:
-        """A hash of frames, poses, colours and vehicle: other recordings are another world."""
-        return digest(f"{self._world.vehicle} {self.recordings.digest()}")
+        """A hash of frames, poses, colours and of a given vehicle: other recordings are another world.
+
+        A vehicle that is identified in them differs in its last digits from one kind of processor to another.
+        """
+        return digest(f"{self._given} {self.recordings.digest()}")
 
     @cached_property
     def scenario(self) -> Scenario:
