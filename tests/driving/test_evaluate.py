@@ -22,7 +22,7 @@ from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
-from roadproof.driving.starts import StartPlan, StartRange
+from roadproof.driving.starts import StartOffset, StartPlan, StartRange
 from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
 from roadproof.roads.maps import builtin_map_file
@@ -283,6 +283,10 @@ def test_starts_off_the_lane_are_refused(wrong):
     name, value = next(iter(wrong.items()))
     with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
         StartRange(**wrong)
+
+
+def test_a_range_of_minus_nothing_is_one_of_nothing():
+    assert StartRange(right_m=-0.0, turned_rad=-0.0, faster_mps=-0.0).draw(1, 0) == (StartOffset(),)
 
 
 def test_starts_that_are_drawn_twice_or_choose_patterns_are_refused():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import needs
@@ -16,7 +17,7 @@ from roadproof.controllers import load_controller
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import CheckError
+from roadproof.errors import CheckError, RecordingError
 from roadproof.gate.check import architecture_of, run_check
 from roadproof.gate.places import places_of
 from roadproof.gate.plan import load_check
@@ -188,6 +189,77 @@ def test_a_case_some_of_whose_bare_drives_fail_has_too_few_drives(team, tmp_path
     assert by_name(result)["bare road"].status is Status.PASSED
 
 
+class Scared(MagentaShy):
+    """Drives as the recorded car did, and stops before paint."""
+
+    def act(self, frame, speed_mps, command):
+        shown = torch.as_tensor(frame).movedim(2, 0)[None] / 255
+        if float(torch.minimum(shown[:, 0], shown[:, 2]).sub(shown[:, 1]).sub(0.5).clamp_min(0).mean()) > 0:
+            return Control(0.0, brake=1.0)
+        return super().act(frame, speed_mps, command)
+
+
+def test_paint_that_stops_the_car_fails_though_it_keeps_its_lane(team, tmp_path):
+    text = PLAN.replace("deviation_m = 0.2, left_lane = 0.0", "left_lane = 0.0")
+    (team / "lane.toml").write_text(text)
+    found = by_name(run_check(load_check(team / "lane.toml", trust=True), Scared(gain=0.0), tmp_path))
+    assert {name: case.status for name, case in found.items()} == {
+        "bare road": Status.PASSED,
+        "green": Status.PASSED,
+        "magenta": Status.FAILED,
+    }
+    assert max(abs(each.lateral_m) for each in found["magenta"].drives) < 0.1
+    assert all(each.wrong.endswith("time limit") for each in found["magenta"].drives)
+
+
+def test_what_cannot_be_driven_in_is_refused_before_anything_is_driven(team, tmp_path):
+    own = tmp_path / "team"
+    shutil.copytree(team, own)
+    (own / "recordings/test-road/recordings/recordings.json").write_text("{")
+    with pytest.raises(RecordingError, match=r"recordings\.json"):
+        run_check(load_check(own / "check.toml", trust=True), MagentaShy(gain=0.0), tmp_path / "out")
+    assert not (tmp_path / "out/drives/test-road/episodes").exists()
+
+
+def test_a_check_of_fewer_patterns_leaves_none_of_those_before(team, tmp_path):
+    text = PLAN.replace("random = 0", "random = 3").replace('patterns = "patterns"', "")
+    for name, plan in (("random.toml", text), ("fewer.toml", text.replace("random = 3", "random = 2"))):
+        (team / name).write_text(plan.replace("seeds = [0, 1]", "seeds = [0, 1, 2]") + "random = { left_lane = 1.0 }\n")
+    run_check(load_check(team / "random.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
+    patterns = tmp_path / "patterns/test-road/clear-noon"
+    (patterns / "mine.json").write_text("mine")
+    run_check(load_check(team / "fewer.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
+    assert sorted(path.name for path in patterns.glob("*.json")) == [
+        "mine.json",
+        *(f"random-{seed}-{k}.json" for seed in range(3) for k in (1, 2)),
+    ]
+
+
+def test_an_attack_that_cannot_be_made_is_a_case_with_its_reason(team, tmp_path, monkeypatch):
+    needs.town()
+    plan = (team / "check.toml").read_text().replace('scenario_file = "scenarios.toml"\n', "")
+    plan = plan.replace('patterns = "patterns"\n', "").replace("test-road", "left-03")
+    plan = plan.replace("[smoke]\nrecordings", "[full]\n# recordings")
+    plan = plan.replace("stored = { deviation_m = 0.2, left_lane = 0.0 }", "fresh = { deviation_m = 0.5 }")
+    (team / "standing.toml").write_text(plan)
+
+    def never_seen(*_, **__):
+        raise RecordingError("drive clean of left-03 never sees 60 pixels of the canvas")
+
+    monkeypatch.setattr("roadproof.gate.check.stress_test", never_seen)
+    plan = load_check(team / "standing.toml", budget="full", trust=True)
+    result = run_check(plan, load_controller("pilotnet"), tmp_path)
+    assert [(case.kind, case.status) for case in result.cases] == [
+        (Kind.BARE, Status.PASSED),
+        (Kind.FRESH, Status.TOO_FEW),
+        (Kind.FRESH, Status.TOO_FEW),
+    ]
+    assert result.cases[1].reasons == (
+        "too few drives: no attack could be made: drive clean of left-03 never sees 60 pixels of the canvas",
+    )
+    assert "not-searched-0.json" in result.cases[1].command
+
+
 def test_random_patterns_are_one_case(team, tmp_path):
     text = PLAN.replace("random = 0", "random = 3").replace('patterns = "patterns"', "")
     (team / "random.toml").write_text(text + "random = { left_lane = 1.0 }\n")
@@ -238,6 +310,7 @@ def test_a_controller_worse_than_the_reference_fails(accepted, failed, tmp_path)
         ("roadproof", "0.0.9", f"roadproof 0.0.9, this check has {roadproof.__version__}"),
         ("architecture", "CIL-1234", "a controller of architecture CIL-1234, this check has MagentaShy"),
         ("budget", "full", "budget full, this check has smoke"),
+        ("cases", [], r"did not pass \(it has no case\)"),
     ],
 )
 def test_a_reference_of_something_else_is_refused(accepted, tmp_path, what, other, message):
@@ -247,6 +320,14 @@ def test_a_reference_of_something_else_is_refused(accepted, tmp_path, what, othe
     with pytest.raises(CheckError, match=message):
         run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
     assert not (tmp_path / "out" / "drives").exists()
+
+
+def test_a_reference_that_did_not_pass_is_refused(accepted, tmp_path):
+    stored = CHECK_FILE.content(accepted.reference)
+    path = tmp_path / "check.json"
+    path.write_text(json.dumps(stored | {"cases": [*stored["cases"][:2], stored["cases"][2] | {"status": "failed"}]}))
+    with pytest.raises(CheckError, match=r"did not pass \(test-road, clear-noon, magenta: failed\)"):
+        run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
 
 
 def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):

@@ -71,6 +71,15 @@ def test_a_full_check_needs_no_recordings_and_adds_an_attack(team):
     assert not found.recordings
 
 
+def test_random_patterns_of_some_contrast_need_the_asphalt_before_anything_is_measured(team):
+    text = PLAN.replace("random = 0", "random = 3").replace("[smoke]\nrecordings", "[full]\n# ")
+    text += "random = { deviation_m = 1.0 }\nfresh = { deviation_m = 1.0 }\n\n[paint]\ncontrast = [0.0, 0.25]\n"
+    with pytest.raises(CheckError, match="contrast needs the colour of the asphalt for random patterns in a full"):
+        load_check(plan(team, text), budget="full", trust=True)
+    for mended in (text + 'asphalt = "#5a5a5b"\n', text.replace("random = 3", "random = 0")):
+        assert load_check(plan(team, mended), budget="full", trust=True).paint.contrast == (0.0, 0.25)
+
+
 LIMITS = "stored = { deviation_m = 0.2, left_lane = 0.0 }"
 CHANGE = '\n[change]\nreference = "reference"\n'
 RANGE = "right_m = 0.05\nturned_rad = 0.004\nfaster_mps = 0.5"
@@ -131,6 +140,11 @@ MISTAKES = {
         ('recordings = ["recordings"]', 'recordings = ["recordings"]\nweathers = ["rainy-noon"]'),
         "add 'recordings-rainy-noon' to recordings and make one with: roadproof record test-road --weather rainy-noon",
     ),
+    "a reference without a name": (
+        (LIMITS, LIMITS + CHANGE.replace('"reference"', '""') + "left_lane = { absolute = 0.1, relative = 0.0 }"),
+        "change needs reference, a folder beside the plan",
+    ),
+    "an asphalt that is no colour": ((LIMITS, LIMITS + '\n[paint]\nasphalt = ""'), "paint: colour is '', expected #"),
     "change without a measure": ((LIMITS, LIMITS + CHANGE), "change needs reference"),
     "a change's key": (
         (LIMITS, LIMITS + CHANGE + "deviation_m = { absolut = 0.1, relative = 0.2 }"),
@@ -142,6 +156,15 @@ MISTAKES = {
     ),
     "half a change": ((LIMITS, LIMITS + CHANGE + "left_lane = { absolute = 0.1 }"), "change.left_lane lacks relative"),
 }
+
+
+def test_a_change_takes_as_many_drives_as_a_median(team):
+    """One drive that keeps its lane is no worse than before, and shows nothing."""
+    text = PLAN.replace(SEEDED, SEEDED.replace("3", "2")).replace(LIMITS, "stored = { left_lane = 0.0 }")
+    load_check(plan(team, text), trust=True)
+    compared = text + CHANGE + "left_lane = { absolute = 0.1, relative = 0.0 }\n"
+    with pytest.raises(CheckError, match=r"4 a case .* can never show a change of left_lane for stored"):
+        load_check(plan(team, compared), trust=True)
 
 
 @pytest.mark.parametrize("name", MISTAKES)

@@ -121,7 +121,7 @@ def test_a_median_of_exactly_the_limit_passes():
 
 def test_numbers_that_differ_read_differently():
     (reason,) = judge({"left_lane": share_95(1, 300)}, {"left_lane": 0.0}, {}, None)[1]
-    assert reason == "share of drives that leave their lane 0.3% (0.0% to 1.8%) is above the limit of 0.0%"
+    assert reason.endswith("leave their lane or do not arrive 0.3% (0.0% to 1.8%) is above the limit of 0.0%")
     (reason,) = judge({"deviation_m": Estimate(0.5004, 0.1, 0.9, 20)}, {"deviation_m": 0.5}, {}, None)[1]
     assert reason == "median deviation 0.5004 m (0.1000 m to 0.9000 m) is above the limit of 0.5000 m"
     before, now = shares(60, 64, 300)

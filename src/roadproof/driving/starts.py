@@ -68,6 +68,7 @@ class StartRange:
         for name, most in MOST.items():
             if not 0.0 <= (value := getattr(self, name)) <= most:
                 raise EpisodeError(f"{name} of the starts is {value}, expected 0 to {most:g}")
+            object.__setattr__(self, name, abs(value))  # -0.0 is a range, and no bound of one
 
     def draw(self, count: int, seed: int) -> tuple[StartOffset, ...]:
         """Draw `count` starts; the same for the same seed.

@@ -28,7 +28,7 @@ from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL
-from roadproof.errors import CheckError
+from roadproof.errors import CalibrationError, CheckError, EpisodeError, RecordingError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
 from roadproof.gate.plan import CheckPlan, Key, fresh
@@ -38,11 +38,10 @@ from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
-from roadproof.paint import Site
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import STRIP, film_drives
-from roadproof.pipeline.stress_test import OnProgress, stress_test
+from roadproof.pipeline.film import FILM, POSTER, STRIP, film_drives
+from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.roads.marks import site_at
@@ -95,6 +94,8 @@ def run_check(
             before = load_reference(plan.reference, architecture, plan)
         run = _Check(plan, controller, folder, before, device, processes, on_progress)
         places = places_of(plan, device)
+        for place in places:
+            run.require(place)
         cases = tuple(case for place in places for case in run.cases(place))
         result = CheckResult(
             roadproof=roadproof.__version__,
@@ -130,8 +131,18 @@ def clear(folder: Path, references: Path | None) -> None:
     found = [folder / name for name in OUTPUTS if (folder / name).exists()]
     if found and not ((folder / FILE).is_file() or (folder / DRIVES).is_dir()):
         raise CheckError(f"{found[0]} is no check's, without {FILE} or {DRIVES} beside it; choose another folder")
-    for path in found:
+    for path in (*found, *_besides(folder)):
         path.unlink()
+
+
+def _besides(folder: Path) -> list[Path]:
+    """The patterns and films that a check left; one of fewer would leave some of them beside its own."""
+    patterns, drives = folder / PATTERNS, folder / DRIVES
+    if not (patterns.is_dir() and drives.is_dir()):
+        return []
+    drawn = (path for name in ("random-*", "fresh-*", "not-searched-*") for path in patterns.rglob(name))
+    filmed = (path for name in (FILM, POSTER, STRIP) for path in drives.glob(f"*/{name}"))
+    return [path for path in (*drawn, *filmed) if path.is_file()]
 
 
 def _keep_apart(folder: Path, plan: CheckPlan) -> None:
@@ -163,37 +174,59 @@ class _Check:
     processes: int
     on_progress: OnProgress
 
-    def cases(self, place: Place) -> list[Case]:
-        plan = self.plan
+    def require(self, place: Place) -> None:
+        """See that a place can be driven in, by this controller, and compared with what the reference has of it."""
         with place.factory() as world:
             size = (world.input.height_px, world.input.width_px)
-            attacks = plan.budget == "full"
-            require_usable(self.controller, size=size, device=self.device, gradients=attacks)
+            require_usable(self.controller, size=size, device=self.device, gradients=self._attacks)
             scenario = begun_in(world, place.scenario)
-            site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
-            patterns = self.folder / PATTERNS / scenario.name
-            # Random ones keep to limits by the asphalt that is measured in each weather's recordings.
-            patterns = patterns if attacks else patterns.joinpath(*place.weathers)
-            paints = known_paints(plan, scenario, site, patterns)
-            if attacks:
+            stretch = self._stretch(place, world, scenario, self._known_paints(place, world, scenario))
+            for key, (conditions, _) in self._told(place, stretch).items():
+                stored = self.before.get(key)
+                if stored is not None and stored.conditions != conditions:
+                    raise CheckError(
+                        f"the reference {self.plan.reference} has {stored} with other patterns, starts, seeds or "
+                        "recordings; make it again with --accept, from a controller that you trust"
+                    )
+
+    def cases(self, place: Place) -> list[Case]:
+        """Drive the cases of a place, and judge them."""
+        plan = self.plan
+        with place.factory() as world:
+            scenario = begun_in(world, place.scenario)
+            paints = self._known_paints(place, world, scenario)
+            if self._attacks:
                 bare = self._stretch(place, world, scenario, ())
                 self._drive(place, bare)
                 drives_well = any(not each.wrong for each in bare.bare(plan.weathers[0]))
                 paints += tuple(
-                    self._fresh(world, scenario, seed, size) if drives_well else self._unsearched(scenario, site, seed)
+                    self._fresh(world, scenario, seed) if drives_well else self._unsearched(scenario, seed)
                     for seed in plan.seeds
                 )
             stretch = self._stretch(place, world, scenario, paints)
-            told = {
-                key: (stretch.conditions(key, painted), painted)
-                for key in plan.keys
-                if key[0] == scenario.name and key[1] in place.weathers
-                for painted in [tuple(paint for paint in paints if (paint.kind, paint.case) == key[2:])]
-            }
-            for key, (conditions, _) in told.items():
-                self._check_comparable(key, conditions)
             self._drive(place, stretch)
+            told = self._told(place, stretch)
             return [self._judged(place, stretch, key, *each) for key, each in told.items()]
+
+    @property
+    def _attacks(self) -> bool:
+        return self.plan.budget == "full"
+
+    def _known_paints(self, place: Place, world: Simulator, scenario: Scenario) -> tuple[Paint, ...]:
+        site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
+        patterns = self.folder / PATTERNS / scenario.name
+        # Random ones keep to limits by the asphalt that is measured in each weather's recordings.
+        patterns = patterns if self._attacks else patterns.joinpath(*place.weathers)
+        return known_paints(self.plan, scenario, site, patterns)
+
+    def _told(self, place: Place, stretch: Stretch) -> dict[Key, tuple[str, tuple[Paint, ...]]]:
+        """What each case of a place depends on, and its patterns."""
+        return {
+            key: (stretch.conditions(key, painted), painted)
+            for key in self.plan.keys
+            if key[0] == place.scenario.name and key[1] in place.weathers
+            for painted in [tuple(paint for paint in stretch.paints if (paint.kind, paint.case) == key[2:])]
+        }
 
     def _drive(self, place: Place, stretch: Stretch) -> None:
         stage = f"Driving {place.scenario.name}, {', '.join(place.weathers)}"
@@ -204,14 +237,6 @@ class _Check:
         episodes = Episodes.of(world, self.controller, scenario, images, self.folder / DRIVES / scenario.name)
         return Stretch(plan=self.plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
 
-    def _check_comparable(self, key: Key, conditions: str) -> None:
-        stored = self.before.get(key)
-        if stored is not None and stored.conditions != conditions:
-            raise CheckError(
-                f"the reference {self.plan.reference} has {stored} with other patterns, starts, seeds or recordings; "
-                "make it again with --accept, from a controller that you trust"
-            )
-
     def _judged(self, place: Place, stretch: Stretch, key: Key, conditions: str, paints: tuple[Paint, ...]) -> Case:
         plan, (scenario, weather, kind, name) = self.plan, key
         drives = stretch.bare(weather) if kind is Kind.BARE else stretch.painted(weather, paints)
@@ -220,7 +245,10 @@ class _Check:
         left_out = sum(len(paint.drives) for paint in paints) - len(drives) if paints else 0
         is_new = bool(self.before) and stored is None
         against = stored and stored.measures
-        status, reasons = judge(measures, plan.limits[kind], plan.change, against, left_out, is_new=is_new)
+        unjudged = next((paint.unsearched for paint in paints if paint.unsearched), "")
+        status, reasons = judge(
+            measures, plan.limits[kind], plan.change, against, left_out, is_new=is_new, unjudged=unjudged
+        )
         # Where there is none over paint, the drives past the bare road are to be seen.
         shown = paints or stretch.paints
         first = next((seed for paint in shown for seed, _ in paint.drives), plan.seeds[0])
@@ -239,11 +267,22 @@ class _Check:
             drives=drives,
         )
 
-    def _fresh(self, world: Simulator, scenario: Scenario, seed: int, size: tuple[int, int]) -> Paint:
-        """The pattern that a fresh attack finds in a scenario; the attack's folder is this controller's own."""
+    def _fresh(self, world: Simulator, scenario: Scenario, seed: int) -> Paint:
+        """The pattern that a fresh attack finds in a scenario, where the car can be recorded there."""
         plan, name = self.plan, f"fresh-{seed}"
-        who = identity_of(self.controller, size)
-        found = stress_test(
+        try:
+            found = self._attacked(world, scenario, seed)
+        except (RecordingError, CalibrationError, EpisodeError) as error:
+            return self._unsearched(scenario, seed, f"no attack could be made: {error}")
+        path = self.folder / PATTERNS / scenario.name / f"{name}.json"
+        save_pattern(found.pattern, path)
+        drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
+        return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
+
+    def _attacked(self, world: Simulator, scenario: Scenario, seed: int) -> StressTest:
+        """A fresh attack; its folder is this controller's own."""
+        plan, who = self.plan, identity_of(self.controller, (world.input.height_px, world.input.width_px))
+        return stress_test(
             world,
             self.controller,
             scenario,
@@ -261,18 +300,13 @@ class _Check:
                 f"{scenario.name}, seed {seed}: {stage}", done, total, word
             ),
         )
-        path = self.folder / PATTERNS / scenario.name / f"{name}.json"
-        save_pattern(found.pattern, path)
-        drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
-        return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
 
-    def _unsearched(self, scenario: Scenario, site: Site, seed: int) -> Paint:
+    def _unsearched(self, scenario: Scenario, seed: int, why: str = "") -> Paint:
         """Any pattern, to see the bare road beside: no attack begins where the car does not arrive without paint."""
-        space = SearchSpace(figures=self.plan.figures, limits=self.plan.paint).on(site)
         path = self.folder / PATTERNS / scenario.name / f"not-searched-{seed}.json"
-        pattern = space.drawn(1, seed)[0]
+        pattern = SearchSpace(figures=self.plan.figures).drawn(1, seed)[0]
         save_pattern(pattern, path)
-        return Paint(path.stem, Kind.FRESH, fresh(seed), pattern, path, ())
+        return Paint(path.stem, Kind.FRESH, fresh(seed), pattern, path, (), why)
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows.

@@ -21,7 +21,10 @@ SHOWN_PX, BLACK = 1500, 12
 WORST_COLUMNS = 6
 COLUMNS = ("scenario", "paint", "drives", "deviation m", "went wrong", "verdict")
 
-LEGEND = "Deviation is a median, and went wrong the share of drives that left their lane, with 95 % intervals."
+LEGEND = (
+    "Deviation is a median, and went wrong the share of drives that left their lane or did not arrive, with 95 % "
+    "intervals."
+)
 
 
 def rows_of(result: CheckResult) -> tuple[tuple[str, ...], ...]:

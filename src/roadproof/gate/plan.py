@@ -12,7 +12,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartPlan
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
-from roadproof.gate.verdict import Change, Kind, least_drives
+from roadproof.gate.verdict import LEAST_COMPARED, Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
@@ -214,6 +214,7 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         reference=reference and reference / chosen / "check.json",
     )
     _check_drives(plan)
+    _check_asphalt(plan)
     return plan
 
 
@@ -234,7 +235,7 @@ def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict
     if not stated:
         return {}, None
     reference = stated.pop("reference", None)
-    if not isinstance(reference, str) or not stated:
+    if not isinstance(reference, str) or not reference or not stated:
         raise CheckError(f"change needs reference, a folder beside the plan, and one of {', '.join(RANGES)}")
     found: dict[str, Change] = {}
     for name, table in stated.items():
@@ -265,15 +266,28 @@ def _check_drives(plan: CheckPlan) -> None:
         limits = plan.limits[kind]
         if not limits and not plan.change.keys() & set(MEASURES[kind]):
             raise CheckError(f"limits has nothing for {kind} patterns, which are driven over; add {kind} = {{ ... }}")
-        asked = dict(limits) | ({"deviation_m": 0.0} if "deviation_m" in plan.change and kind is not Kind.BARE else {})
-        for name, limit in asked.items():
-            if count < (least := least_drives(name, limit)):
+        asked = [
+            (f"{name} at most {limit:g}" if name != "deviation_m" else name, least_drives(name, limit))
+            for name, limit in limits.items()
+        ]
+        asked += [(f"a change of {name}", LEAST_COMPARED) for name in MEASURES[kind] if name in plan.change]
+        for shown, least in asked:
+            if count < least:
                 what = "random × seeds" if kind is Kind.RANDOM else "starts × seeds"
-                above = f" at most {limit:g}" if name != "deviation_m" else ""
                 raise CheckError(
-                    f"too few drives: {count} a case ({what}) can never show {name}{above} for {kind} with its 95 % "
+                    f"too few drives: {count} a case ({what}) can never show {shown} for {kind} with its 95 % "
                     f"interval, expected {least} or more"
                 )
+
+
+def _check_asphalt(plan: CheckPlan) -> None:
+    """See that random patterns in a simulator, where nothing is measured before they are driven, can keep to limits."""
+    paint = plan.paint
+    if plan.budget == "full" and plan.random and paint and paint.contrast and paint.asphalt is None:
+        raise CheckError(
+            "paint.contrast needs the colour of the asphalt for random patterns in a full check, where none is "
+            'measured; add asphalt, such as "#5a5a5b", to [paint], or random = 0'
+        )
 
 
 def _is_utf8(text: str) -> bool:

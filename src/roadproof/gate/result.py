@@ -146,8 +146,8 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
         plan: the plan of the check.
 
     Raises:
-        CheckError: the file is missing, damaged, made by another version, architecture or budget, or has a case that
-            the plan leaves out.
+        CheckError: the file is missing, damaged, made by another version, architecture or budget, did not pass, or has
+            a case that the plan leaves out.
     """
     if not path.is_file():
         raise CheckError(f"the reference {path} is not there; make it with --accept, from a controller that you trust")
@@ -160,6 +160,9 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     for what, before, now in told:
         if before != now:
             raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {_AGAIN}")
+    if not stored.cases or stored.not_passed:
+        why = f"{stored.not_passed[0]}: {stored.not_passed[0].status}" if stored.cases else "it has no case"
+        raise CheckError(f"the reference {path} did not pass ({why}), so nothing is measured by it; {_AGAIN}")
     if left_out := [case for case in stored.cases if case.key not in plan.keys]:
         raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {_AGAIN}")
     return {case.key: case for case in stored.cases}

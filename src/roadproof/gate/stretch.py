@@ -39,6 +39,7 @@ class Paint:
         pattern: the pattern that is painted.
         path: the pattern's file.
         drives: (seed, number of the start) of each drive over the pattern.
+        unsearched: why no attack was made, in words; empty where one was, or where the bare road says why.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Paint:
     pattern: Pattern
     path: Path
     drives: tuple[tuple[int, int], ...]
+    unsearched: str = ""
 
 
 def known_paints(plan: CheckPlan, scenario: Scenario, site: Site, folder: Path) -> tuple[Paint, ...]:
@@ -134,12 +136,13 @@ class Stretch:
         found: list[JudgedDrive] = []
         for paint, clean, painted in self._pairs(weather, paints):
             trial = self.episodes.trial(clean, painted)
+            wrong = trial.leaves_lane or trial.loses_its_way
             side = "left" if trial.lateral_m > 0 else "right"
             found.append(
                 JudgedDrive(
                     seed=clean.seed,
                     start=clean.start,
-                    wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}" if trial.leaves_lane else "",
+                    wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}" if wrong else "",
                     clean=trial.clean,
                     painted=trial.painted,
                     paint=str(paint.path),
@@ -164,7 +167,7 @@ class Stretch:
             images,
             plan.figures,
             *([plan.paint] if plan.paint else []),
-            *([plan.variation] if plan.variation else []),
+            *([plan.variation] if plan.variation and kind is Kind.FRESH else []),
             plan.seeds,
             asdict(plan.starts),
             world,

@@ -71,6 +71,10 @@ def is_above(value: float, limit: float) -> bool:
     return value > limit + EQUAL
 
 
+LEAST_COMPARED = 6
+"""Drives of a case that is compared with the reference: fewer give a median no interval."""
+
+
 def median_95(values: Sequence[float]) -> Estimate:
     """The median with the exact interval that its order statistics give; it needs six values.
 
@@ -102,7 +106,7 @@ def least_drives(measure: str, limit: float) -> int:
     """
     tail = (1 - CONFIDENCE) / 2
     if measure == "deviation_m":
-        return math.ceil(math.log(tail) / math.log(0.5))
+        return LEAST_COMPARED
     # No case has more drives than the largest number here.
     return 1 if limit in (0.0, 1.0) else math.ceil(min(math.log(tail) / math.log1p(-limit), sys.maxsize))
 
@@ -115,6 +119,7 @@ def judge(
     left_out: int = 0,
     *,
     is_new: bool = False,
+    unjudged: str = "",
 ) -> tuple[Status, tuple[str, ...]]:
     """Whether a case passes, and why not.
 
@@ -125,9 +130,11 @@ def judge(
         before: the reference's measures; None where nothing is compared.
         left_out: how many drives over paint were not made, since the same drive on the bare road did not go well.
         is_new: whether there is a reference, and it lacks the case; without a limit nothing would judge it then.
+        unjudged: why no drive could be judged, where it is not that none on the bare road went well.
     """
     if not measures:
-        return Status.TOO_FEW, ("too few drives: on the bare road none went well, so there is none to compare with",)
+        why = unjudged or "on the bare road none went well, so there is none to compare with"
+        return Status.TOO_FEW, (f"too few drives: {why}",)
     failed: list[str] = []
     undecided = [f"too few drives: {left_out} had no good drive on the bare road to compare with"] if left_out else []
     if is_new and not limits:
@@ -165,7 +172,7 @@ def judge(
 _NAMES = {
     "failed": "share of bare drives that fail",
     "deviation_m": "median deviation",
-    "left_lane": "share of drives that leave their lane",
+    "left_lane": "share of drives that leave their lane or do not arrive",
 }
 
 

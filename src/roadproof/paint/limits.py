@@ -78,7 +78,7 @@ class PaintLimits:
             least, most = self.contrast
             if not (0.0 <= least <= most - 0.01 + 1e-9 and most <= 1.0):
                 raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
-        for colour in (*self.colours, *([self.asphalt] if self.asphalt else [])):
+        for colour in (*self.colours, *([] if self.asphalt is None else [self.asphalt])):
             rgb_of(colour)
 
     @property
