@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, site_of
+from roadproof.attacks import AttackResult, kept_attack, kept_cheapest, site_of
 from roadproof.attacks.cheapest import cheapest_in_words
 from roadproof.attacks.objective import varied
 from roadproof.compositing import Variation
@@ -116,17 +116,11 @@ class Cell:
         )
 
     def _cheapest(self, recordings: RecordingSet, found: AttackResult) -> Iterator[Row]:
-        place = self.folder / _folder(CHEAPEST)
-        if (place / "cheapest.json").exists():
-            less = Cheapest.load(place)
-        else:
-            groups = BUDGET.method.groups(recordings)
-            searched = cheapest(recordings, self.controller, found, WANTED_M, groups=groups, folder=place)
-            if searched is None:
-                print(f"{self.spec}, {self.scenario.name}: {cheapest_in_words(None, WANTED_M)}", flush=True)
-                return
-            searched.save(place)
-            less = searched
+        place, groups = self.folder / _folder(CHEAPEST), BUDGET.method.groups(recordings)
+        less = kept_cheapest(place, recordings, self.controller, found, WANTED_M, groups=groups)
+        if less is None:
+            print(f"{self.spec}, {self.scenario.name}: {cheapest_in_words(None, WANTED_M)}", flush=True)
+            return
         levels = [asdict(level) for level in less.levels]
         yield self._driven(recordings, CHEAPEST, less.pattern, predicted_m=less.predicted_m, levels=levels)
 

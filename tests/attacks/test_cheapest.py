@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -10,11 +11,12 @@ import pytest
 import torch
 
 from recorded_drives import VEHICLE, drivable_set
-from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
-from roadproof.attacks.cheapest import _Narrowing, cheapest_in_words
+from roadproof.attacks import Cheapest, GradOpt, PathDeviation, SteeringShift, attack, cheapest, site_of
+from roadproof.attacks.cheapest import Level, _Narrowing, cheapest_in_words
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
+from roadproof.compositing import Variation
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.paint import PaintLimits, conspicuousness
 from roadproof.recorded.vehicle import Vehicle
@@ -151,6 +153,33 @@ def test_the_figures_that_stay_are_the_same_without_the_one_that_goes(monkeypatc
         alone = both.without_a_figure()
         torch.testing.assert_close(alone.pattern.boxes, both.pattern.boxes[[kept]], atol=1e-3, rtol=0)
         torch.testing.assert_close(alone.pattern.colours, both.pattern.colours[[kept]])
+
+
+def test_a_file_without_levels_or_area_is_damaged(searched, tmp_path):
+    _, found = searched
+    level = Level(8.0, 1, 0.06)
+    told = {"group": found.group, "wanted_m": 0.05, "predicted_m": 0.06, "levels": (level,)}
+    Cheapest(pattern=found.pattern, conspicuousness=found.conspicuousness, **told).save(tmp_path)
+    path = tmp_path / "cheapest.json"
+    content = json.loads(path.read_text())
+    for broken in ({"levels": []}, {"conspicuousness": {"figures": 1}}):
+        path.write_text(json.dumps(content | broken))
+        with pytest.raises(RoadproofError, match=r"cheapest\.json is incomplete or damaged.*the least paint has"):
+            Cheapest.load(tmp_path)
+
+
+def test_the_least_paint_is_looked_for_in_expectation_where_the_strongest_was(searched, monkeypatch):
+    road, found = searched
+    asked, looks = [], Variation(draws=2)
+
+    def measure(self, *_, **_how):
+        asked.append(self)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PathDeviation, "measure", measure)
+    with pytest.raises(KeyboardInterrupt):
+        cheapest(road, PullsToBrightPaint(), found, 0.1, groups=[RIGHT_GROUP], objective=SteeringShift(variation=looks))
+    assert asked == [PathDeviation(variation=looks)]
 
 
 def test_a_deviation_that_nothing_reaches_has_no_cheapest_pattern(searched):

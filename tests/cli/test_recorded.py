@@ -1,6 +1,7 @@
 """The commands that drive in recordings, as their users call them."""
 
 import dataclasses
+import sys
 
 import pytest
 
@@ -75,7 +76,7 @@ def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke
         told = {"group": found.group, "wanted_m": wanted_m, "predicted_m": 0.06, "levels": (Level(8.0, 1, 0.06),)}
         return Cheapest(pattern=found.pattern, conspicuousness=found.conspicuousness, **told)
 
-    monkeypatch.setattr("roadproof.attacks.cheapest", least)
+    monkeypatch.setattr(sys.modules["roadproof.attacks.cheapest"], "cheapest", least)
     quick = [
         "--objective",
         "steering",
@@ -94,12 +95,28 @@ def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke
     told = answered(printed.out)
     assert told.pop("cheapest") == stored(tmp_path / "cheapest" / "cheapest.json")
     assert told == stored(tmp_path / "result.json")
-    # What was found for another deviation does not stay where none is found.
-    monkeypatch.setattr("roadproof.attacks.cheapest", lambda *_, **_how: None)
+    # It is not looked for twice, and what was found for one deviation is none for another.
+    monkeypatch.setattr(sys.modules["roadproof.attacks.cheapest"], "cheapest", lambda *_, **_how: None)
+    code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
+    assert code == 0, printed.err
+    assert answered(printed.out)["cheapest"] == stored(tmp_path / "cheapest" / "cheapest.json")
+    shy[shy.index("0.05")] = "0.07"
+    code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick)
+    assert code == 2
+    assert "holds a search with wanted_m 0.05, now it is 0.07" in printed.err
+    shy[-1] = tmp_path / "none"
     code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
     assert code == 0, printed.err
     assert answered(printed.out)["cheapest"] is None
-    assert not list((tmp_path / "cheapest").iterdir())
+    assert [path.name for path in (tmp_path / "none" / "cheapest").iterdir()] == ["none.json"]
+
+
+def test_the_least_paint_needs_gradients_whatever_the_method(workplace, tmp_path, invoke):
+    without = ["--controller", "bad_drivers:InPlace", "--method", "random", "--cheapest", "0.05"]
+    code, printed = invoke("attack", workplace / "run" / "recordings", *without, "--out", tmp_path / "out")
+    assert (code, printed.out) == (2, "")
+    assert "gradient" in printed.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_limits_cost_is_told_of_a_search_alone(workplace, tmp_path, invoke, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -66,7 +67,9 @@ def in_black(found):
 def asked(monkeypatch):
     """What the search for less paint was asked for; it finds nothing."""
     asked = []
-    monkeypatch.setattr(stages, "cheapest", lambda *given, **_: asked.append(given[3]))
+    monkeypatch.setattr(
+        sys.modules["roadproof.attacks.cheapest"], "cheapest", lambda *given, **_: asked.append(given[3])
+    )
     return asked
 
 

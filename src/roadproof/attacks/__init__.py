@@ -11,6 +11,7 @@ from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
 from roadproof.attacks.blackbox import RandomSearch as RandomSearch
 from roadproof.attacks.cheapest import Cheapest as Cheapest
 from roadproof.attacks.cheapest import cheapest as cheapest
+from roadproof.attacks.cheapest import kept_cheapest as kept_cheapest
 from roadproof.attacks.driven import InSimulator as InSimulator
 from roadproof.attacks.groups import parse_groups as parse_groups
 from roadproof.attacks.method import Method as Method

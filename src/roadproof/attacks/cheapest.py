@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -26,13 +27,16 @@ from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.gradopt import Rung, Running, gradopt
 from roadproof.attacks.groups import Group
 from roadproof.attacks.methods import GradOpt
-from roadproof.attacks.objective import Objective, PathDeviation
+from roadproof.attacks.objective import Objective, PathDeviation, variation_of
 from roadproof.attacks.result import AttackResult, Candidate
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.io.files import AnyPath, as_path, remove
+from roadproof.io.files import AnyPath, as_path, remove, write_json
+from roadproof.io.identity import digest, require_same, stated
+from roadproof.io.known import known_by
 from roadproof.io.records import RecordFile
+from roadproof.io.text import read_json
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
 from roadproof.paint.limits import area_m2
 from roadproof.patterns import Pattern, load_pattern, save_pattern
@@ -45,6 +49,7 @@ MOST_LEVELS = 14
 _LOWER, _SMALLEST_STEP = 0.7, 0.9
 _NO_LIMIT_M2 = 1e4
 _SEARCH = "search"
+_NONE = "roadproof-cheapest-none", 1
 RUNGS = (Rung(1, 8, 0.03),)
 """What is climbed below each limit of the area."""
 
@@ -78,6 +83,9 @@ class Cheapest:
         predicted_m: deviation that it is predicted to cause, metres: the least over small errors.
         conspicuousness: how conspicuous the pattern is on this road.
         levels: every pattern that still reached the deviation, the strongest first.
+
+    Raises:
+        RoadproofError: there is no level, or no area.
     """
 
     pattern: Pattern
@@ -86,6 +94,13 @@ class Cheapest:
     predicted_m: float
     conspicuousness: Conspicuousness
     levels: tuple[Level, ...]
+
+    def __post_init__(self) -> None:
+        if not self.levels or self.conspicuousness.area_m2 is None:
+            raise RoadproofError(
+                f"the least paint has {len(self.levels)} levels and {self.conspicuousness.area_m2} m², expected one or "
+                "more, and an area"
+            )
 
     @property
     def candidate(self) -> Candidate:
@@ -169,7 +184,8 @@ def cheapest(
             f"the pattern was found for {found.group}, the groups are {', '.join(names)}; "
             "give the groups of the search before"
         )
-    goal = objective if isinstance(objective, PathDeviation) else PathDeviation()
+    variation = None if objective is None else variation_of(objective)
+    goal = objective if isinstance(objective, PathDeviation) else PathDeviation(variation=variation)
     measure = goal.measure(recordings, controller, groups, device=device)
     site = site_of(recordings)
     # Any limit of the area that holds already makes the search know the size of the canvas.
@@ -208,6 +224,56 @@ def cheapest(
         conspicuousness=conspicuousness(pattern, run.space.site or site),
         levels=tuple(levels),
     )
+
+
+def kept_cheapest(
+    folder: Path,
+    recordings: RecordingSet,
+    controller: Controller,
+    found: AttackResult,
+    wanted_m: float,
+    *,
+    groups: Sequence[Group],
+    objective: Objective | None = None,
+    device: torch.device | str = "cpu",
+    on_level: Callable[[int, float], object] = lambda _level, _area_m2: None,
+) -> Cheapest | None:
+    """Search once: if the folder already holds what came of this search, read it instead.
+
+    `folder` is that of the result, and keeps an interrupted search; all else is as in `cheapest`.
+
+    Raises:
+        RoadproofError: the stored result is damaged, belongs to another search or does not say to which, or the search
+            itself fails.
+        OutputError: the folder cannot be written.
+    """
+    made_of = {
+        "wanted_m": wanted_m,
+        "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16],
+        "pattern": digest(stated(known_by(found.pattern)))[:16],
+    }
+    none, path = folder / "none.json", folder / "cheapest.json"
+    if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
+        return None
+    if path.exists():
+        require_same(folder, "a search", FILE.content(path).get("made_of"), made_of, RoadproofError)
+        return Cheapest.load(folder)
+    less = cheapest(
+        recordings,
+        controller,
+        found,
+        wanted_m,
+        groups=groups,
+        objective=objective,
+        device=device,
+        folder=folder,
+        on_level=on_level,
+    )
+    if less is None:
+        write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
+    else:
+        less.save(folder, made_of)
+    return less
 
 
 def cheapest_in_words(found: Cheapest | None, wanted_m: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from roadproof.cli.verbs import begin, keep_command
 from roadproof.limits import MANY
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult, Method, Objective
+    from roadproof.attacks import AttackResult, Objective
     from roadproof.attacks.groups import Group
     from roadproof.controllers import Controller
     from roadproof.recordings import RecordingSet
@@ -124,7 +123,9 @@ def attack(
     searches = 1 + (len(relaxed_limits(space, goal)) if limit_costs else 0)
     attacked = load_controller(controller, device=device, dtype=dtype)
     multiply_in(dtype)
-    _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
+    # The least paint is looked for by gradient, whatever the method.
+    by_gradient = searched.by_gradient or cheapest is not None
+    _check_attacked(attacked, drives, goal, by_gradient=by_gradient, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)
     work = of_search(searched, goal, frames, attacked, groups=len(chosen))
@@ -157,7 +158,7 @@ def attack(
 
 
 def _check_attacked(
-    attacked: Controller, drives: RecordingSet, method: Method, objective: Objective, *, device: str, dtype: str
+    attacked: Controller, drives: RecordingSet, objective: Objective, *, by_gradient: bool, device: str, dtype: str
 ) -> None:
     """Refuse a controller that the search cannot work on, before it begins; say where its arithmetic is slow."""
     from roadproof.attacks import SpeedChange
@@ -166,7 +167,7 @@ def _check_attacked(
     from roadproof.controllers.precision import multiplies_bfloat16
 
     size = (drives.view.height_px, drives.view.width_px)
-    require_usable(attacked, size=size, device=device, drives=False, gradients=method.by_gradient)
+    require_usable(attacked, size=size, device=device, drives=False, gradients=by_gradient)
     if isinstance(objective, SpeedChange):
         require_pedals(attacked)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
@@ -195,12 +196,13 @@ def _less_paint(
     folder: Path,
 ) -> dict[str, Any] | None:
     """The least paint for a deviation, which the folder keeps, as its file has it; None if there is none."""
-    from roadproof.attacks import cheapest
+    from roadproof.attacks import kept_cheapest
     from roadproof.attacks.cheapest import MOST_LEVELS, cheapest_in_words
     from roadproof.cli.progress import progress
 
     with progress("Looking for less paint", MOST_LEVELS) as show:
-        less = cheapest(
+        less = kept_cheapest(
+            folder,
             drives,
             attacked,
             strongest,
@@ -208,17 +210,10 @@ def _less_paint(
             groups=groups,
             objective=objective,
             device=device,
-            folder=folder,
             on_level=show,
         )
     say(cheapest_in_words(less, wanted_m))
-    if less is None:
-        shutil.rmtree(folder / "search", ignore_errors=True)
-        for name in ("cheapest.json", "pattern.json", "pattern.png"):  # of another deviation, asked for before
-            (folder / name).unlink(missing_ok=True)
-        return None
-    less.save(folder)
-    return stored(folder / "cheapest.json")
+    return None if less is None else stored(folder / "cheapest.json")
 
 
 def _limit_costs(

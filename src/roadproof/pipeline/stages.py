@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, Candidate, Cheapest, Method, cheapest, kept_attack, parse_groups
-from roadproof.attacks.cheapest import FILE, MOST_LEVELS
+from roadproof.attacks import AttackResult, Candidate, Cheapest, Method, kept_attack, kept_cheapest, parse_groups
+from roadproof.attacks.cheapest import MOST_LEVELS
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import own_objective, variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
@@ -17,11 +17,8 @@ from roadproof.controllers.identity import identity_of, parts_of
 from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import RoadproofError
-from roadproof.io.files import write_json
-from roadproof.io.identity import digest, require_same, stated
+from roadproof.io.identity import digest, stated
 from roadproof.io.known import known_by, without_addresses
-from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -40,7 +37,6 @@ from roadproof.simulators.protocol import Simulator, world_of
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
 
-_NONE = "roadproof-cheapest-none", 1
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Called with the name of a stage, how many of its steps are done, how many there are, and a word on the last one."""
@@ -177,31 +173,19 @@ class Stages:
     ) -> tuple[Cheapest, Selection] | None:
         """The least paint for a deviation, and the drive over it; None if nothing found reaches that deviation."""
         folder, total = self.folder / CHEAPEST, MOST_LEVELS + 1
-        boxes = digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]
-        made_of = {"wanted_m": wanted_m, "strongest": boxes, "pattern": digest(stated(known_by(found.pattern)))[:16]}
-        none = folder / "none.json"
-        if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
+        less = kept_cheapest(
+            folder,
+            recordings,
+            self.controller,
+            found,
+            wanted_m,
+            groups=self.groups(recordings),
+            objective=self.budget.objective,
+            device=self.device,
+            on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
+        )
+        if less is None:
             return None
-        if (folder / "cheapest.json").exists():
-            before = FILE.content(folder / "cheapest.json").get("made_of")
-            require_same(folder, "a search", before, made_of, RoadproofError)
-            less = Cheapest.load(folder)
-        else:
-            less = cheapest(
-                recordings,
-                self.controller,
-                found,
-                wanted_m,
-                groups=self.groups(recordings),
-                objective=self.budget.objective,
-                device=self.device,
-                folder=folder,
-                on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
-            )
-            if less is None:
-                write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
-                return None
-            less.save(folder, made_of)
         driven = self._drive_over(
             [less.candidate],
             1,

@@ -194,7 +194,8 @@ def stress_test(
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
-    require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
+    by_gradient = budget.method.by_gradient or cheapest_m is not None
+    require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=by_gradient)
     if isinstance(budget.objective, SpeedChange):
         require_pedals(controller)
     with working_in(folder), stages.pool:
