@@ -399,6 +399,12 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         '"reference"', '"kept"'
     )
     (team / "loose.toml").write_text(loose)
+    # What could not be kept at the end is not driven.
+    (team / "kept").write_text("mine")
+    code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path / "new", "--accept")
+    assert (code, "cannot write" in said.err) == (2, True), said.err
+    assert not (tmp_path / "new" / "drives").exists()
+    (team / "kept").unlink()
     # Not even the first result, passed or not, is made where the references are.
     code, said = invoke("check", "loose.toml", "--trust", "--out", "kept/smoke", "--accept")
     assert (code, "kept for a reference" in said.err) == (2, True)

@@ -44,6 +44,7 @@ def check(
     from roadproof.gate.plan import BUDGETS, load_check, references_of
     from roadproof.gate.result import FILE
     from roadproof.gate.verdict import Status
+    from roadproof.io.files import check_writable
     from roadproof.io.locks import hold
 
     references = references_of(plan)
@@ -54,6 +55,8 @@ def check(
     chosen = load_check(plan, budget=asked, trust=trust)
     if accept and chosen.reference is None:
         raise CheckError(f"--accept makes a reference, but {plan} names none; add [change] with reference")
+    if accept and chosen.reference is not None and not is_dry_run():
+        check_writable(chosen.reference.parent)
     if chosen.budget == "full":
         check_processes(chosen.simulator, processes)
     who = load_controller(chosen.controller, device=device)
