@@ -205,6 +205,7 @@ MISTAKES = {
         "in metres of deviation",
     ),
     "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
+    "cars": ([*EVALUATE, "--cars", "50"], "--cars is 50, but recordings hold no others"),
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
     "another scenario": ([*EVALUATE, "--scenario", "left-03"], "the scenario's canvas has y_m"),
     "no folder": ([*EVALUATE[:-1], "recorded:"], "expected the folder of recordings"),

@@ -8,6 +8,7 @@ from PIL import Image
 
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import NOMINAL
+from roadproof.errors import EpisodeError
 from roadproof.gate.outputs import SHOWN_PX, WORST_COLUMNS, rows_of, write_junit, write_summary, write_worst
 from roadproof.gate.result import Case, CheckResult, JudgedDrive
 from roadproof.gate.verdict import Kind, Status, share_95
@@ -76,3 +77,10 @@ def test_the_worst_drive_is_shown_without_what_was_not_recorded_however_dark_it_
     write_worst(tmp_path / "strip.npz", tmp_path / "worst.jpg")
     with Image.open(tmp_path / "worst.jpg") as shown:
         assert shown.size == (SHOWN_PX, round(SHOWN_PX * rows / (80 * WORST_COLUMNS)))
+
+
+@pytest.mark.parametrize(("count", "lateral_m"), [(0, 0.0), (3, np.nan), (3, np.inf)])
+def test_a_strip_of_nothing_or_of_no_number_is_none(count, lateral_m):
+    pictures = np.zeros((count, 60, 80, 3), np.uint8)
+    with pytest.raises(EpisodeError, match="or none at all|are not finite"):
+        Strip(time_s=np.arange(float(count)), lateral_m=np.full(count, lateral_m), clean=pictures, painted=pictures)

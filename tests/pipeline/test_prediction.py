@@ -17,6 +17,14 @@ from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace
 
 
+def test_a_prediction_with_some_of_the_four_speeds_is_none():
+    path, numbers = np.zeros((3, 2)), dict.fromkeys(("predicted_m", "least_m", "most_m", "driven_m"), 0.5)
+    numbers |= dict.fromkeys(("path_error_m", "gap_m", "gap_rad"), 0.1)
+    paths = {"clean_xy": path, "predicted_xy": path, "driven_xy": path}
+    with pytest.raises(EpisodeError, match="some of the four speeds, expected all or none"):
+        Prediction(**numbers, **paths, driven_mps=0.5)
+
+
 @pytest.fixture(scope="module")
 def run(town, tmp_path_factory):
     """Drives of the town past a bare canvas, calibrated."""

@@ -159,6 +159,24 @@ def test_drives_that_all_jobs_lack_are_missing_too(finished, tmp_path):
     assert "1 failed or missing, 17 without some drives, listed below" in page.read_text()
 
 
+def test_jobs_of_the_plan_that_have_no_row_yet_are_missing(finished, tmp_path):
+    folder, rows, _ = finished
+    whole = rows[rows["error"].isna()]
+    asked = [JobId(*each) for each in whole[list(JobId._fields)].drop_duplicates().itertuples(index=False)]
+    plan = {"format": "roadproof-study-run", "version": 1, "reference": None}
+    for name, jobs in (("whole", asked), ("begun", [*asked, JobId("left-39", "7", "CMA", 3)]), ("wrong", [["left-39"]])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "jobs").symlink_to(folder / "jobs")
+        (tmp_path / name / "study.json").write_text(json.dumps(plan | {"jobs": jobs}))
+    assert "listed below" not in write_tables(whole, tmp_path / "whole", tmp_path / "out").read_text()
+    page = write_tables(whole, tmp_path / "begun", tmp_path / "out").read_text()
+    assert f"{len(asked)} of {len(asked) + 1}" in page
+    assert "1 failed or missing, listed below" in page
+    assert "no row; not done yet" in page
+    with pytest.raises(StudyError, match=r"study\.json is damaged \(jobs: "):
+        write_tables(whole, tmp_path / "wrong", tmp_path / "out")
+
+
 def test_a_weather_never_names_a_file_elsewhere(finished):
     folder, rows, _ = finished
     job = next(
@@ -268,6 +286,13 @@ def test_pictures_need_no_files_of_jobs(finished, tmp_path):
             "method": {"name": "BO", "search": "gradopt", "scheme": "odd"}}""",
             StudyError,
             "job.json is damaged .*odd",
+        ),
+        (
+            "job.json",
+            b"""{"controller": "cil", "scenario": {"map_name": "town", "canvas": {"x_m": 0, "y_m": 0}},
+            "method": {"name": "BO", "search": "gradopt", "scheme": "group", "attack_weathers": [1]}}""",
+            StudyError,
+            "job.json is damaged .*Expected `str`, got `int`",
         ),
         ("pattern.json", b"{}", PatternError, "pattern.json has format None"),
     ],

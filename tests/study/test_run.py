@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import needs
 from roadproof.errors import StudyError
-from roadproof.study.folder import read_table
+from roadproof.study.folder import Planned, named, planned_in, read_table
 from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
 from roadproof.study.run import run_study
@@ -48,6 +49,52 @@ def test_every_job_gives_its_rows_and_what_is_done_is_not_done_again(small_study
     runs = {job.key: (tmp_path / "work" / job.key / "runs").read_text().count("run") for job in small_study.jobs}
     assert runs.pop(lost.key) == 2
     assert set(runs.values()) == {1}
+
+
+def test_an_interrupted_study_has_the_rows_of_its_plan_and_says_which_are_not_done(two_jobs, tmp_path):
+    before, now = two_jobs.figures
+    run_study(dataclasses.replace(two_jobs, figures=(before,)), tmp_path, counts)
+
+    def stop(done, _job, _result):
+        raise KeyboardInterrupt
+
+    study = dataclasses.replace(two_jobs, figures=(now, 3), reference="GradOpt")
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study, tmp_path, counts, on_job=stop)
+    assert set(read_table(tmp_path)["figures"]) == {str(now)}
+    assert planned_in(tmp_path) == Planned(reference="GradOpt", jobs=tuple(named(job) for job in study.jobs))
+    with pytest.raises(KeyboardInterrupt):
+        run_study(dataclasses.replace(two_jobs, figures=(4,)), tmp_path, counts, on_job=stop)
+    assert set(read_table(tmp_path)["figures"]) == {"4"}
+
+
+def test_a_run_that_is_refused_leaves_a_study_as_it_was(two_jobs, tmp_path):
+    run_study(two_jobs, tmp_path, counts)
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    other = dataclasses.replace(two_jobs, figures=(3,))
+    with pytest.raises(StudyError, match="no Ray cluster answers"):
+        run_study(other, tmp_path, counts, cluster="nowhere")
+    with pytest.raises(StudyError, match="workers is 2, but a cluster has as many"):
+        run_study(other, tmp_path, counts, cluster="local", workers=2)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == kept
+
+
+@pytest.mark.parametrize("name", ["rows.parquet", "transfer.parquet"])
+def test_a_table_damaged_anywhere_is_one_line(two_jobs, tmp_path, name):
+    frame = run_study(two_jobs, tmp_path, counts)
+    path = tmp_path / name
+    frame.to_parquet(path, index=False)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for at in rng.integers(0, len(whole), 400).tolist():
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ int(rng.integers(1, 256))]) + whole[at + 1 :])
+        try:
+            read_table(tmp_path, name)
+        except StudyError as error:
+            refused += 1
+            cure = "run the study again" if name == "rows.parquet" else "remove it and run the transfer again"
+            assert cure in str(error)
+    assert refused > 100
 
 
 def test_a_job_that_fails_is_a_row_that_says_why_and_is_tried_again(small_study, tmp_path):

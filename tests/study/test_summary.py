@@ -45,3 +45,11 @@ def test_a_transfer_is_a_mean_for_each_method_and_controller():
         "BO, found against cil: 1.50 m deviation of cil",
         "BO, found against cil: 0.25 m deviation of own",
     )
+
+
+def test_a_pattern_of_which_drives_were_left_out_counts_as_much_as_others():
+    told = {"found_on": "cil", "controller": "own"}
+    five = [row("BO", 1.0, **told)] * 5
+    assert transfer_summary(DataFrame([*five, row("BO", 4.0, seed=1, **told)])) == (
+        "BO, found against cil: 2.50 m deviation of own",
+    )

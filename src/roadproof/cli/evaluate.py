@@ -61,8 +61,8 @@ def evaluate(
             default="10, or 0 in recordings",
         ),
     ] = None,
-    cars: Annotated[int, number("Other cars in those.", 0, MAX_CROWD)] = 20,
-    pedestrians: Annotated[int, number("People about in those.", 0, MAX_CROWD)] = 20,
+    cars: Annotated[int | None, number("Other cars in those.", 0, MAX_CROWD, default="20")] = None,
+    pedestrians: Annotated[int | None, number("People about in those.", 0, MAX_CROWD, default="20")] = None,
     random: Annotated[int, number("Random patterns to compare with.", 0, 1000)] = 0,
     recordings: Annotated[Path | None, unset("The set attacked, to compare composites with what is rendered.")] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
@@ -91,7 +91,7 @@ def evaluate(
     if weathers is not None:
         skies = options.weathers_of(weathers, "weathers")
     if where.recorded is not None:
-        _check_recorded(where.recorded, skies, runs, recordings)
+        _check_recorded(where.recorded, skies, recordings, runs=runs, cars=cars, pedestrians=pedestrians)
         runs = cars = pedestrians = 0
     else:
         options.check_processes(simulator, processes)
@@ -104,6 +104,7 @@ def evaluate(
     if recorded is not None and not isinstance(who, Controller):
         raise RoadproofError(f"--recordings compares answers to pictures, but {controller} looks at none; leave it out")
     runs = 10 if runs is None else runs
+    cars, pedestrians = (20 if each is None else each for each in (cars, pedestrians))
     if runs and not cars + pedestrians:
         raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
@@ -186,15 +187,16 @@ def _figures(pattern: Path, *, needed: bool) -> Pattern | None:
 
 
 def _check_recorded(
-    recorded: Recorded, weathers: tuple[Weather, ...], runs: int | None, recordings: Path | None
+    recorded: Recorded, weathers: tuple[Weather, ...], recordings: Path | None, **others: int | None
 ) -> None:
     """Refuse what recordings cannot give, before anything is driven: other weathers, traffic, renders."""
     if other := [weather for weather in weathers if weather != recorded.weather]:
         raise RoadproofError(
             f"--weathers has {other[0]}, but the recordings have the light of {recorded.weather}; leave it out"
         )
-    if runs:
-        raise RoadproofError(f"--runs is {runs}, but recordings hold no others on the road; expected 0")
+    for name, count in others.items():
+        if count:
+            raise RoadproofError(f"--{name} is {count}, but recordings hold no others on the road; expected 0")
     if recordings is not None:
         raise RoadproofError("--recordings compares with what a simulator renders; nothing is rendered in recordings")
 

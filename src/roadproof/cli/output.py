@@ -8,6 +8,7 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any, TextIO
+from unicodedata import category
 
 from rich import box
 from rich.console import Console, RenderableType
@@ -64,7 +65,7 @@ def say(*lines: RenderableType, wrapped: bool = False) -> None:
     if _answers is not None and is_quiet():
         return
     console = Console(soft_wrap=not wrapped, highlight=False, markup=False, emoji=False)
-    for line in lines:
+    for line in (_harmless(line) if isinstance(line, str) else line for line in lines):
         if isinstance(line, Table):
             # Alone it would be made to fit, also into 80 columns of a file.
             wide = Console(width=_WIDEST).measure(line).maximum
@@ -73,6 +74,19 @@ def say(*lines: RenderableType, wrapped: bool = False) -> None:
             elif wide > console.width:
                 line.padding = 0
         console.print(line)
+
+
+class _Harmless(Table):
+    """A table of names that may come from anyone's files."""
+
+    def add_row(self, *cells: RenderableType | None, **how: Any) -> None:  # noqa: ANN401  # as of `Table`
+        super().add_row(*(_harmless(cell) if isinstance(cell, str) else cell for cell in cells), **how)
+
+
+def _harmless(text: str) -> str:
+    """A text without what would steer a terminal, which is shown by its code."""
+    steers = (mark != "\n" and category(mark)[0] == "C" for mark in text)
+    return "".join(repr(mark)[1:-1] if bad else mark for mark, bad in zip(text, steers, strict=True))
 
 
 def table(words: tuple[str, ...], numbers: tuple[str, ...] = (), *, title: str | None = None, note: str = "") -> Table:
@@ -84,7 +98,7 @@ def table(words: tuple[str, ...], numbers: tuple[str, ...] = (), *, title: str |
         title: a line above the table; None for none.
         note: a line below the table; empty for none.
     """
-    made = Table(box=box.SIMPLE, title=title, title_justify="left", caption=note, caption_justify="left")
+    made = _Harmless(box=box.SIMPLE, title=title, title_justify="left", caption=note, caption_justify="left")
     for column in words:
         made.add_column(column, no_wrap=bool(numbers) or column == words[0])
     for column in numbers:

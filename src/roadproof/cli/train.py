@@ -20,7 +20,9 @@ def train(
         str | None, unset("Weights file or shipped controller to go on from.", default="fresh weights")
     ] = None,
     drives: Annotated[int, number("Drives of the expert.", 1, MANY)] = 260,
-    painted_drives: Annotated[int, number("Drives of the expert over random paint, besides.", 0, MANY)] = 0,
+    painted_drives: Annotated[
+        int, number("Drives of the expert besides, four in five over random paint.", 0, MANY)
+    ] = 0,
     pasted: Annotated[float, number("Share of the pictures with rectangles pasted on the road.", 0.0, 1.0)] = 0.0,
     samples: Annotated[int, number("Frames seen in the first training.", 1, 10**9)] = 200_000,
     learning_rate: Annotated[float, number("The largest of the first training.", 1e-9, 10.0)] = 1.2e-3,

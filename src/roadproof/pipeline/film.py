@@ -61,7 +61,7 @@ class Strip(Saved):
         painted: camera pictures of the drive over the paint, (n, height, width, 3).
 
     Raises:
-        EpisodeError: there are not as many of all.
+        EpisodeError: there are not as many of all, there is none, or a number is not finite.
     """
 
     time_s: Float[np.ndarray, " n"]
@@ -70,8 +70,11 @@ class Strip(Saved):
     painted: UInt8[np.ndarray, "n height width 3"]
 
     def __post_init__(self) -> None:
-        if len({len(self.time_s), len(self.lateral_m), len(self.clean), len(self.painted)}) > 1:
-            raise EpisodeError("the strip has not one picture of each drive at each time")
+        counts = {len(self.time_s), len(self.lateral_m), len(self.clean), len(self.painted)}
+        if len(counts) > 1 or not len(self.time_s):
+            raise EpisodeError("the strip has not one picture of each drive at each time, or none at all")
+        if not (np.isfinite(self.time_s).all() and np.isfinite(self.lateral_m).all()):
+            raise EpisodeError("the strip has times or distances that are not finite")
 
 
 Strip.FILE = RecordFile(kind=Strip, header=None, error=EpisodeError, remedy="evaluate again", level=1)

@@ -42,6 +42,9 @@ class Prediction(Saved):
         clean_xy: world x, y of the clean drive while the canvas is in view, metres, (t, 2).
         predicted_xy: world x, y of the predicted drive at the same instants, metres, (t, 2).
         driven_xy: world x, y of the drive over the pattern at those instants, metres, (u, 2).
+
+    Raises:
+        EpisodeError: there are some of the four speeds, and not all.
     """
 
     predicted_m: float
@@ -59,6 +62,11 @@ class Prediction(Saved):
     most_mps: float | None = None
     driven_mps: float | None = None
     made_of: str = ""
+
+    def __post_init__(self) -> None:
+        speeds = (self.predicted_mps, self.least_mps, self.most_mps, self.driven_mps)
+        if len({speed is None for speed in speeds}) > 1:
+            raise EpisodeError("the prediction has some of the four speeds, expected all or none")
 
     @property
     def error_m(self) -> float:

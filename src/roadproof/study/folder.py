@@ -1,6 +1,6 @@
 """The folder of a study: what is kept of every job, and all rows as one table.
 
-study.json                  which method tables compare with the others
+study.json                  which method tables compare with the others, and which jobs the plan has
 jobs/KEY/job.json           what was asked for; KEY is a hash of it
 jobs/KEY/rows.json          its rows; there when the job is finished, or has failed
 jobs/KEY/pattern.json       what it found, and pattern.png
@@ -9,7 +9,7 @@ jobs/KEY/passage-*.jpg      what the car's camera sees while it passes the patte
 jobs/KEY/history.json       how the search went (`study.history`)
 work/KEY/                   what a job keeps while it runs, to go on from
 work/shared/                what several jobs need (`study.shared`)
-rows.parquet                every row of every job (`study.rows`)
+rows.parquet                every row of every job that has some (`study.rows`)
 transfer.parquet            the patterns driven by other controllers (`study.transfer`)
 """
 
@@ -17,16 +17,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
+
 from roadproof.errors import StudyError
-from roadproof.io.files import check_closed, write_atomically, write_text
+from roadproof.foreign import in_one_line
+from roadproof.io.files import check_closed, remove, write_atomically, write_text
 from roadproof.io.text import read_json
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import Frame, JobResult, Row
+from roadproof.study.rows import Frame, JobId, JobResult, Row
 
 TRANSFERRED = "transfer.parquet"
 ROWS = ("roadproof-study-rows", 1)
@@ -59,7 +62,7 @@ def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:
     if not path.exists():
         return None
     rows: object = read_json(path, *ROWS, StudyError).get("rows")
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in cast("list[object]", rows)):
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in cast("list[object]", rows)):
         raise StudyError(f"{path} is damaged (it has no list of rows); remove it, and the job is done again")
     # Rows of an older roadproof have no key of their own.
     return tuple(cast("Row", {"job": job.key, **row}) for row in cast("list[dict[str, Any]]", rows))
@@ -71,24 +74,64 @@ def is_done(job: Job, folder: Path) -> bool:
     return rows is not None and not any(row.get("error") for row in rows)
 
 
-def write_study(study: Study, folder: Path) -> None:
-    """Keep what the tables need of a study's plan and cannot know from the jobs.
+def named(job: Job) -> JobId:
+    """What names a job in the rows."""
+    return JobId(job.scenario.name, str(job.figures), job.method.name, job.seed)
+
+
+def write_study(study: Study, jobs: Iterable[Job], folder: Path) -> None:
+    """Keep what the tables need of a study's plan and cannot know from the rows.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    _write_json(folder / "study.json", {"format": STUDY[0], "version": STUDY[1], "reference": study.reference})
+    asked = [named(job) for job in jobs]
+    content = {"format": STUDY[0], "version": STUDY[1], "reference": study.reference, "jobs": asked}
+    _write_json(folder / "study.json", content)
 
 
-def reference_of(folder: Path) -> str | None:
-    """The name of the method that the study's plan compares with the others; None where it names none.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Planned:
+    """What the folder says of a study's plan.
+
+    Args:
+        reference: the name of the method that tables compare with the others; None where it names none.
+        jobs: what names each job; empty where nobody says, as in folders of earlier versions.
+    """
+
+    reference: str | None = None
+    jobs: tuple[JobId, ...] = ()
+
+
+def planned_in(folder: Path) -> Planned:
+    """What a study's folder says of its plan.
 
     Raises:
         StudyError: the file is damaged.
     """
     path = folder / "study.json"
-    name = read_json(path, *STUDY, StudyError).get("reference") if path.exists() else None
-    return None if name is None else str(name)
+    if not path.exists():
+        return Planned()
+    content = read_json(path, *STUDY, StudyError)
+    name, jobs = content.get("reference"), content.get("jobs", [])
+    try:
+        asked = msgspec.convert(jobs, tuple[JobId, ...])
+    except msgspec.ValidationError as error:
+        raise StudyError(f"{path} is damaged (jobs: {error}); run the study again, finished jobs are kept") from None
+    return Planned(reference=None if name is None else str(name), jobs=asked)
+
+
+def write_table_so_far(jobs: Iterable[Job], folder: Path) -> None:
+    """Gather the rows that there are, as `write_table`; where there are none, none of an earlier plan stay.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    jobs = list(jobs)
+    if any(read_rows(job, folder) for job in jobs):
+        write_table(jobs, folder)
+    else:
+        remove(folder / "rows.parquet")
 
 
 def write_table(jobs: Iterable[Job], folder: Path) -> Frame:
@@ -124,10 +167,12 @@ def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
         raise StudyError(f"{folder} has no {name}; run the study first")
     check_closed(folder, StudyError)
     library = pandas()
+    again = "run the study again, finished jobs are kept"
+    cure = again if name != TRANSFERRED else "remove it and run the transfer again, its drives are kept"
     try:
         return library.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"{path} is damaged ({error}); run the study again, finished jobs are kept") from None
+    except Exception as error:  # of two libraries, by whatever is damaged
+        raise StudyError(f"{path} is damaged ({in_one_line(error)}); {cure}") from None
 
 
 def read_transfers(folder: Path) -> Frame | None:

@@ -208,4 +208,6 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
 def _method(told: Mapping[str, Any]) -> StatedMethod:
     """A method as job.json has it; what is empty may be missing in an older one."""
     settings = {name: value for name, value in told.items() if name != "name" and value}
+    if "attack_weathers" in settings:
+        settings["attack_weathers"] = msgspec.convert(settings["attack_weathers"], list[str])
     return replace(msgspec.convert(told, StatedMethod), settings=settings)

@@ -18,7 +18,7 @@ from roadproof.report.formatting import in_words, markdown_text
 from roadproof.report.html import rendered
 from roadproof.report.plots import save
 from roadproof.study.charts import Picture, by_figures, progress
-from roadproof.study.folder import reference_of
+from roadproof.study.folder import planned_in
 from roadproof.study.kept_jobs import KeptJob, StatedMethod, read_jobs
 from roadproof.study.paper_tables import GAPS, paper_tables
 from roadproof.study.pictures import gallery, passages, trajectories
@@ -51,7 +51,9 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     jobs = read_jobs(folder, rows)
     any_job = next(iter(jobs.values()), None)  # all have the plan's conditions
     weathers, planned = ((), None) if any_job is None else (any_job.weathers, any_job.planned)
-    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder), weathers, planned)
+    plan = planned_in(folder)
+    methods = [job.method for job in jobs.values()]
+    results = results_of(rows, methods, plan.reference, weathers, planned, plan.jobs)
     kept, again = (None, "") if transfer is None else _of_these_jobs(transfer, results)
     driven = [] if kept is None or kept.empty else [(kept, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))

@@ -68,6 +68,7 @@ class Results:
         seeds: the seeds, in rising order.
         weathers: that in which patterns were found, then the others of the drives.
         planned: how many drives a job has in a weather, alone or in traffic; empty where nobody says.
+        asked: what names each job of the plan; empty where nobody says.
     """
 
     drives: Frame
@@ -79,6 +80,7 @@ class Results:
     seeds: tuple[int, ...]
     weathers: tuple[str, ...]
     planned: Mapping[tuple[str, bool], int]
+    asked: tuple[JobId, ...] = ()
 
     @property
     def home(self) -> str:
@@ -151,7 +153,9 @@ class Results:
 
     @property
     def jobs(self) -> tuple[JobId, ...]:
-        """Every combination of the scenarios, K, methods and seeds that occur, done or not."""
+        """The plan's jobs, done or not; where nobody says, every combination of scenarios, K, methods and seeds."""
+        if self.asked:
+            return self.asked
         names = [method.name for method in self.methods]
         return tuple(JobId(*job) for job in product(self.kinds, self.figures, names, self.seeds))
 
@@ -199,6 +203,7 @@ def results_of(
     named: str | None = None,
     weathers: Sequence[str] = (),
     planned: Mapping[tuple[str, bool], int] | None = None,
+    asked: Sequence[JobId] = (),
 ) -> Results:
     """Sort a study's rows into drives and failures.
 
@@ -209,6 +214,7 @@ def results_of(
         weathers: the plan's weathers, that in which patterns were found first; where nobody says, they are in the order
             of the rows.
         planned: how many drives a job has in a weather, alone or in traffic; None where nobody says.
+        asked: what names each job of the plan; empty where nobody says.
 
     Raises:
         StudyError: there is no row, a column is missing, a number is not finite, or every job failed.
@@ -239,6 +245,7 @@ def results_of(
         seeds=tuple(sorted(map(int, rows["seed"].unique()))),
         weathers=tuple(order),
         planned=planned or {},
+        asked=tuple(asked),
     )
 
 

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,7 +17,7 @@ from roadproof.io.locks import own_folder, working_in
 from roadproof.machine import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
-from roadproof.study.folder import is_done, pandas, write_result, write_study, write_table
+from roadproof.study.folder import is_done, pandas, write_result, write_study, write_table, write_table_so_far
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, failed
 
@@ -46,7 +46,7 @@ def run_study(
         study: the study whose jobs are done.
         folder: the folder where results are kept; may hold those of a run before.
         work: does one job; a function of a module, since it runs in other processes.
-        workers: how many processes work on this machine, each with one thread.
+        workers: how many processes work on this machine, each with one thread; 1 with a cluster.
         cluster: address of a Ray cluster, "local" for one on this machine; None does without Ray.
         on_job: called after every job with how many are done, the job and its result.
 
@@ -58,19 +58,53 @@ def run_study(
         raise StudyError(f"workers is {workers}, expected 1 or more")
     if is_server(study.simulator) and (workers > 1 or cluster is not None):
         raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
+    if cluster is not None and workers > 1:
+        raise StudyError(f"workers is {workers}, but a cluster has as many as it has cores; leave one of them out")
     pandas()  # what writes the table is missed now, not after the night
-    with working_in(folder):
-        write_study(study, folder)
+    with working_in(folder), _ray_at(cluster) as ray:
         jobs = study.jobs  # once: the controller's file may be written again meanwhile
         left = [job for job in jobs if not is_done(job, folder)]
         done = len(jobs) - len(left)
-        results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
-        with closing(results):
-            for job, result in results:
-                write_result(job, result, folder)
-                done += 1
-                on_job(done, job, result)
+        write_study(study, jobs, folder)
+        # However this run ends, the table is of this plan, and has what is there.
+        write_table_so_far(jobs, folder)
+        results = _on_this_machine(left, folder, work, workers) if ray is None else _on_ray(left, work, ray)
+        try:
+            with closing(results):
+                for job, result in results:
+                    write_result(job, result, folder)
+                    done += 1
+                    on_job(done, job, result)
+        finally:
+            write_table_so_far(jobs, folder)
         return write_table(jobs, folder)
+
+
+@contextmanager
+def _ray_at(cluster: str | None) -> Generator[Any]:
+    """Ray, connected to a cluster; None where none is asked for, and this machine has what it needs."""
+    if cluster is None:
+        try:
+            import_module("threadpoolctl")
+        except ImportError as error:
+            raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
+        yield None
+        return
+    try:
+        ray: Any = import_module("ray")
+    except ImportError:
+        raise StudyError("a cluster needs ray; install roadproof[ray]") from None
+    if ray.is_initialized():
+        yield ray
+        return
+    try:
+        ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
@@ -89,10 +123,6 @@ def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
 
 
 def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Generator[tuple[Job, JobResult]]:
-    try:
-        import_module("threadpoolctl")
-    except ImportError as error:
-        raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
     # Threads that each wait for a process of their own: one that dies takes its job with it and no other.
     pool = ThreadPoolExecutor(workers)
     try:
@@ -110,17 +140,7 @@ def _in_own_process(job: Job, scratch: Path, work: Work) -> tuple[Job, JobResult
             return job, failed(job, "its process died, most likely for want of memory; use fewer workers")
 
 
-def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Generator[tuple[Job, JobResult]]:
-    try:
-        ray: Any = import_module("ray")
-    except ImportError:
-        raise StudyError("a cluster needs ray; install roadproof[ray]") from None
-    ours = not ray.is_initialized()
-    if ours:
-        try:
-            ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
+def _on_ray(jobs: Sequence[Job], work: Work, ray: Any) -> Generator[tuple[Job, JobResult]]:  # noqa: ANN401  # the module
     running: dict[Any, Job] = {}
     try:
         remote = ray.remote(max_retries=1)(_on_node)
@@ -137,8 +157,6 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Generator[tuple[Jo
         # A study that is interrupted leaves no job behind on a cluster that goes on.
         for reference in running:
             ray.cancel(reference, force=True)
-        if ours:
-            ray.shutdown()
 
 
 def _on_node(job: Job, work: Work) -> JobResult:

@@ -35,8 +35,10 @@ def failures(rows: Frame) -> tuple[str, ...]:
 
 
 def transfer_summary(rows: Frame) -> tuple[str, ...]:
-    """A line for each method and controller of a transfer: the mean deviation, over the drives that all made."""
-    means = made_by_all(rows).groupby(["method", "found_on", "controller"], sort=False)["deviation_m"].mean()
+    """A line for each method and controller of a transfer: the mean over patterns, of the drives that all made."""
+    whose = ["method", "found_on", "controller"]
+    patterns = made_by_all(rows).groupby([*_OTHERS, *whose], sort=False)["deviation_m"].mean()
+    means = patterns.groupby(level=whose, sort=False).mean()
     return tuple(
         f"{method}, found against {found_on}: {deviation_m:.2f} m deviation of {controller}"
         for (method, found_on, controller), deviation_m in means.items()

@@ -22,9 +22,9 @@ from roadproof.io.locks import working_in
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.folder import TRANSFERRED, is_done, pandas, read_transfers
+from roadproof.study.folder import TRANSFERRED, is_done, named, pandas, read_transfers
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import Frame, JobId, TransferRow, drive_columns, job_columns
+from roadproof.study.rows import Frame, TransferRow, drive_columns, job_columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,10 @@ def transfer(
     if not found:
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
-    pandas()  # what writes the table is missed now, not after the last drive
+    # What reads and writes the table, and what is wrong with it, is missed now, not after the last drive.
+    before = read_transfers(folder)
+    if before is not None and not {"job", "controller"} <= set(before):
+        raise StudyError(f"{folder / TRANSFERRED} does not say of which jobs it is; remove it and give this again")
     rows, failures, done = list[TransferRow](), list[str](), 0
     with working_in(folder), open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
@@ -77,12 +80,12 @@ def transfer(
                 try:
                     evaluation = _evaluated(job, folder, world, spec, driver)
                 except RoadproofError as error:
-                    failures.append(f"{spec}: {_named(job)}: {error}")
+                    failures.append(f"{spec}: {named(job)}: {error}")
                 else:
                     rows += _rows(job, spec, evaluation)
                     if lost := evaluation.left_out:
                         failures.append(
-                            f"{spec}: {_named(job)}: {lost} of {lost + len(evaluation.trials)} drives left out, since "
+                            f"{spec}: {named(job)}: {lost} of {lost + len(evaluation.trials)} drives left out, since "
                             "without paint the car never came to the canvas"
                         )
                 done += 1
@@ -90,16 +93,11 @@ def transfer(
     if not rows:
         raise StudyError(f"no pattern could be driven over; the first of {len(failures)}: {failures[0]}")
     frame = pandas().DataFrame(rows)
-    before = read_transfers(folder)
     if before is not None:
         others = before["job"].isin([job.key for job in found]) & ~before["controller"].isin(list(drivers))
         frame = pandas().concat([before[others], frame], ignore_index=True) if others.any() else frame
     write_atomically(folder / TRANSFERRED, lambda part: frame.to_parquet(part, index=False))
     return Transfer(frame, tuple(failures))
-
-
-def _named(job: Job) -> JobId:
-    return JobId(job.scenario.name, str(job.figures), job.method.name, job.seed)
 
 
 def _evaluated(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> Evaluation:

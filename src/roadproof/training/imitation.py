@@ -257,7 +257,9 @@ def _resume(
             network.load_state_dict(content["network"])
             average.load_state_dict(content["average"])
             optimiser.load_state_dict(content["optimiser"])
-            return int(content["step"])
-    except (RuntimeError, ValueError, KeyError, TypeError, OSError, EOFError, UnpicklingError):
+            if not 0 <= (step := int(content["step"])) <= plan.steps:
+                raise ValueError(step)
+            return step
+    except (AttributeError, RuntimeError, ValueError, KeyError, TypeError, OSError, EOFError, UnpicklingError):
         raise TrainingError(f"checkpoint {path} is damaged or of another network; delete it") from None
     raise TrainingError(f"checkpoint {path} was made with other settings; delete it or choose another folder")

@@ -79,5 +79,10 @@ class Shard(Saved):
 
 # Full compression takes longer than the drive's pictures take to render.
 Shard.FILE = RecordFile(
-    kind=Shard, name="roadproof-shard", version=2, error=TrainingError, remedy="collect it again", level=1
+    kind=Shard,
+    name="roadproof-shard",
+    version=2,
+    error=TrainingError,
+    remedy="remove it, and the same command collects it again",
+    level=1,
 )
