@@ -164,10 +164,11 @@ def test_files_that_are_missing_or_no_json_are_refused(tmp_path):
         load_pattern(tmp_path / "text.json")
 
 
-def test_the_figures_are_not_written_where_their_picture_goes(tmp_path):
+@pytest.mark.parametrize("name", ["x.png", "x", "x.npz"])
+def test_figures_are_written_as_json_alone_beside_their_picture(tmp_path, name):
     pattern = Pattern((Shape.ELLIPSE,), torch.full((1, 5), 50.0), torch.rand(1, 3))
-    with pytest.raises(PatternError, match=r"x\.png is where the picture of a pattern goes"):
-        save_pattern(pattern, tmp_path / "x.png")
+    with pytest.raises(PatternError, match=f"{name} does not end in .json; give such a path"):
+        save_pattern(pattern, tmp_path / name)
     assert not any(tmp_path.iterdir())
 
 

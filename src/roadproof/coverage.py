@@ -19,6 +19,7 @@ camera's own pixels, which an input has that is as large as its crop (`footprint
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import cast
@@ -47,6 +48,14 @@ def footprint_variance(view: CropResize) -> float:
         return FOOTPRINT_VARIANCE[view.resampling]
     enlarged = 1.0 if camera_px < 1.0 and view.resampling != "area" else 0.0
     return (0.5 + enlarged) / camera_px**2
+
+
+def footprint_px(variance: float) -> int:
+    """How far beside a pixel on the canvas footprints still touch it, in whole px of the input (`footprint_variance`).
+
+    At a sharp corner the nearest pixel on the canvas is further off, which counts where pixels are small.
+    """
+    return 1 if variance <= 1.0 else math.ceil(math.sqrt(variance)) + 1
 
 
 MIN_VARIANCE = 1e-4

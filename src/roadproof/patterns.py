@@ -213,11 +213,11 @@ def save_pattern(pattern: Pattern, path: AnyPath) -> None:
 
     Raises:
         PatternError: the pattern is a batch, has values that are not finite, or a figure of it is not valid; or the
-            path ends in .png, where the picture goes.
+            path does not end in .json.
         OutputError: the folder cannot be written.
     """
-    if as_path(path).suffix == ".png":
-        raise PatternError(f"{path} is where the picture of a pattern goes; give a path that ends in .json")
+    if as_path(path).suffix != ".json":
+        raise PatternError(f"{path} does not end in .json; give such a path, beside which its picture goes as .png")
     path, picture = as_path(path), Image.fromarray(raster(pattern))
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())

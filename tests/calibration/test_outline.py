@@ -1,18 +1,25 @@
 """Edges of canvas and squares against a plain supersampled picture of them."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from references import approach
 from roadproof.calibration import outline
+from roadproof.calibration.calibrate import _check as require_good
 from roadproof.calibration.compiled import GREY, SQUARES
 from roadproof.calibration.outline import fit_outline, moved, outline_errors_px, predicted_contrast
+from roadproof.calibration.replays import Replays
 from roadproof.calibration.report import Spread, stated_errors_px
+from roadproof.calibration.two_paint import look_at_paints
 from roadproof.datatypes import VehicleState
+from roadproof.drives.folder import read_drive
+from roadproof.errors import CalibrationError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.lens import Lens
+from team_folder import write_recorded
 
 OFF = np.array([0.004, 0.008, 0.002, 0.08, -0.02, 0.1])
 """A camera that looks 0.2° lower, 0.5° aside, is turned by 0.1°, and 8, 2 and 10 cm away."""
@@ -53,6 +60,41 @@ def test_a_pose_that_is_off_is_mended_to_a_tenth_of_its_error_and_below_half_a_p
     assert before > 5.0
     assert after < 0.5
     assert np.nanmean(outline_px) < 0.5 * np.nanmean(outline_errors_px(prior, visible, CIL_CAMERA, view))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize(
+    ("ahead_m", "aside_m", "lower_deg", "accepted"),
+    [(0.0, 0.3, 0.3, True), (0.0, 4.0, 0.0, False), (8.0, 0.0, 0.0, False), (0.0, 0.0, 20.0, False)],
+)
+def test_a_canvas_that_lies_elsewhere_is_refused_however_far(tmp_path, refine, ahead_m, aside_m, lower_deg, accepted):
+    def poses(x_m, y_m, pitch_deg):
+        camera = dataclasses.replace(CIL_CAMERA, pitch_deg=CIL_CAMERA.pitch_deg + pitch_deg)
+        canvas = CanvasPlacement(x_m=x_m, y_m=y_m, width_m=3.5, length_m=6.0)
+        states = [VehicleState(at_m, 0.0) for at_m in np.linspace(0.0, 8.0, 6).tolist()]
+        return np.stack([homography_from_pose(camera, state, canvas) for state in states])
+
+    share, contrast = predicted_contrast(poses(18.0 + ahead_m, aside_m, lower_deg), CIL_INPUT, CIL_CAMERA)
+    light = 60.0 + 140.0 * share
+    shown = {"light": light, "dark": np.clip(light - 170.0 * contrast, 0, 255)}
+    frames = {name: np.repeat(values[..., None], 3, -1).round().astype(np.uint8) for name, values in shown.items()}
+
+    class Seen(Replays):
+        def __init__(self):
+            """Nothing is driven."""
+
+        def look(self, drive, target):
+            return frames[target.name]
+
+    write_recorded(tmp_path)
+    drive = read_drive("clean", tmp_path / "record")
+    drive = dataclasses.replace(
+        drive, frames=frames["light"], frame_number=np.arange(6), steer=np.zeros(6), right_m=np.zeros(6)
+    )
+    geometry, _ = look_at_paints(Seen(), drive, poses(18.0, 0.0, 0.0), CIL_CAMERA, CIL_INPUT, refine=refine)
+    said = "of what is seen of the canvas lies where the pose has none of it"
+    with nullcontext() if accepted else pytest.raises(CalibrationError, match=said):
+        require_good(drive, geometry)
 
 
 def test_a_pose_that_is_right_stays_right(scene):

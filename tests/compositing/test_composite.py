@@ -7,9 +7,11 @@ import torch
 from references import approach
 from roadproof.compositing import Compositor, composite, view_canvas
 from roadproof.compositing.composite import blend, canvas_colours, dense_colours
-from roadproof.coverage import Shape
+from roadproof.compositing.view import canvas_pixels
+from roadproof.coverage import Footprints, Shape, canvas_share, footprint_variance
+from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, PatternError
-from roadproof.geometry import CIL_INPUT
+from roadproof.geometry import CIL_INPUT, CameraModel, CanvasPlacement, CropResize, homography_from_pose, sight
 from roadproof.patterns import Pattern, coverages, visibilities
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.search_space import SearchSpace
@@ -150,6 +152,26 @@ def test_pixel_maps_give_every_pixel_its_own_light():
     row = frames[-1, 0, 60]
     assert row[80:95].tolist() == pytest.approx([0.5] * 15, abs=1e-4)
     assert row[105:120].tolist() == pytest.approx([0.25] * 15, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(100, 44), (200, 88), (400, 176), (600, 264)])
+def test_no_pixel_that_shows_paint_stays_bare_where_the_input_is_larger_or_smaller_than_its_crop(size):
+    camera = CameraModel(width_px=200, height_px=150, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+    view = CropResize(left_px=0, top_px=40, right_px=200, bottom_px=128, width_px=size[0], height_px=size[1])
+    canvas = CanvasPlacement(x_m=12.0, y_m=0.0, width_m=3.5, length_m=6.0)
+    homography = homography_from_pose(camera, VehicleState(0.0, 0.0), canvas)
+    taken, *_ = canvas_pixels(homography[None], view)
+    inverse = np.linalg.inv(view.input_from_camera @ homography)
+    through, bend = sight(view)
+    mapped = (inverse @ through).T
+    ahead = mapped[:, 2] > 0
+    centre = mapped[ahead, :2] / mapped[ahead, 2:]
+    slope = (inverse[:2] - centre[:, :, None] * inverse[2:]) @ bend[ahead]
+    whole = Footprints.of(centre, slope / mapped[ahead, 2][:, None, None], footprint_variance(view))
+    share = torch.zeros(view.width_px * view.height_px)
+    share[np.flatnonzero(ahead)] = canvas_share(whole).float()
+    share[torch.as_tensor(taken)] = 0.0
+    assert share.max() < 0.02
 
 
 def test_frames_that_do_not_show_the_canvas_are_refused():

@@ -23,6 +23,7 @@ from roadproof.controllers import (
 from roadproof.controllers.exported import TorchProgram, _pickles_refused
 from roadproof.controllers.loading import PICKLES
 from roadproof.errors import ControllerError, DeviceError
+from roadproof.io.known import known_by
 
 CARD = ControllerCard(
     target_speed_mps=7.0, preparation=FramePreparation(frame_size=(24, 32), rows=(8, 24), network_size=(16, 16))
@@ -86,6 +87,22 @@ def test_a_program_answers_and_differentiates_as_its_network(program):
     agree(controller, Net().eval(), inputs(5)[0])
     report = check_controller(controller)
     assert report.passed, report.failures
+
+
+def test_programs_of_equal_weights_are_told_apart(tmp_path):
+    class Steers(nn.Module):
+        def __init__(self, most):
+            super().__init__()
+            self.weight, self.most = nn.Parameter(torch.ones(3)), most
+
+        def forward(self, frames):
+            return (frames.mean((2, 3)) * self.weight).sum(1).clamp(-self.most, self.most)
+
+    known = []
+    for name, most in (("one", 0.9), ("same", 0.9), ("other", 0.8)):
+        export(Steers(most), inputs()[:1], tmp_path / f"{name}.pt2")
+        known.append(known_by(TorchProgram(tmp_path / f"{name}.pt2", torch.device("cpu"))))
+    assert known[0] == known[1] != known[2]
 
 
 def test_a_card_beside_it_says_how_frames_are_prepared(program):

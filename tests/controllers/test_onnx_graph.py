@@ -15,6 +15,7 @@ from onnx.reference import ReferenceEvaluator
 from roadproof.controllers.onnx_graph import OnnxGraph
 from roadproof.controllers.onnx_operators import OPERATORS
 from roadproof.errors import ControllerError
+from roadproof.io.known import known_by
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.normal(size=(2, 4, 7, 9)).astype(np.float32)
@@ -355,6 +356,20 @@ def test_constants_move_with_the_module_and_are_cast_with_it(tmp_path):
     answer = graph(torch.tensor(MATRIX, dtype=torch.float64))
     assert answer.dtype == torch.float64
     np.testing.assert_allclose(answer.numpy(), 3 * MATRIX.astype(np.float64))
+
+
+def test_graphs_of_equal_weights_are_told_apart(tmp_path):
+    def known(nodes, name):
+        (tmp_path / name).mkdir()
+        return known_by(
+            OnnxGraph(written(model(nodes, [("x", np.ones((1, 3)))], constants={"w": np.ones(3)}), tmp_path / name))
+        )
+
+    add = helper.make_node("Add", ["x", "w"], ["sum"], doc_string="where it comes from")
+    plain = known([add, helper.make_node("Identity", ["sum"], ["y"])], "plain")
+    assert known([add, helper.make_node("Relu", ["sum"], ["y"])], "cut") != plain
+    noted = helper.make_node("Add", ["x", "w"], ["sum"], name="added", doc_string="from elsewhere")
+    assert known([noted, helper.make_node("Identity", ["sum"], ["y"])], "noted") == plain
 
 
 def test_what_cannot_be_computed_is_named(tmp_path):

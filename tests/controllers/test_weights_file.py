@@ -1,5 +1,6 @@
 """Weights files: saved, read with their card, refused where they do not fit."""
 
+import os
 import shutil
 
 import numpy as np
@@ -19,6 +20,7 @@ from roadproof.controllers import (
 )
 from roadproof.controllers.weights_file import fill_from
 from roadproof.errors import ControllerError, OutputError
+from roadproof.io.text import MOST_TEXT_BYTES
 
 
 def test_a_card_beside_bare_weights_says_the_rest(pilotnet_data, tmp_path):
@@ -108,6 +110,17 @@ def test_a_card_beside_weights_counts_also_where_the_architecture_is_named(tmp_p
     path.with_suffix(".json").write_text('{"loss": [0.1]}')
     assert load_controller(f"pilotnet:{path}").cruise.target_mps == 6.0, "it is no card"
     with pytest.raises(ControllerError, match="is not a controller card"):
+        load_controller(path)
+
+
+def test_a_card_is_read_within_bounds_and_from_a_file(tmp_path, monkeypatch):
+    path = tmp_path / "net.safetensors"
+    save_file(pilotnet_controller().network.state_dict(), path)
+    os.mkfifo(path.with_suffix(".json"))
+    assert load_controller(f"pilotnet:{path}").cruise.target_mps == 6.0, "nobody writes into that pipe"
+    path.with_suffix(".json").unlink()
+    path.with_suffix(".json").write_text(" " * (MOST_TEXT_BYTES + 1))
+    with pytest.raises(ControllerError, match=r"cannot read the card .*net\.json: it is larger than 33,554,432 bytes"):
         load_controller(path)
 
 

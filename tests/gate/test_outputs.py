@@ -82,5 +82,5 @@ def test_the_worst_drive_is_shown_without_what_was_not_recorded_however_dark_it_
 @pytest.mark.parametrize(("count", "lateral_m"), [(0, 0.0), (3, np.nan), (3, np.inf)])
 def test_a_strip_of_nothing_or_of_no_number_is_none(count, lateral_m):
     pictures = np.zeros((count, 60, 80, 3), np.uint8)
-    with pytest.raises(EpisodeError, match="or none at all|are not finite"):
+    with pytest.raises(EpisodeError, match=r"or none at all|are not finite"):
         Strip(time_s=np.arange(float(count)), lateral_m=np.full(count, lateral_m), clean=pictures, painted=pictures)

@@ -55,6 +55,13 @@ def test_bad_pictures_are_refused(tmp_path: Path, content: bytes, reason: str) -
     assert str(refused.value).endswith("copy it again")
 
 
+def test_a_picture_with_a_fragment_of_exif_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path, exif=b"Exif\0\0II*\0")
+    with pytest.raises(RoadproofError, match="cannot be read"):
+        read_picture(path, RoadproofError, "copy it again")
+
+
 def test_the_size_is_looked_at_before_a_picture_is_unpacked(tmp_path: Path) -> None:
     """Its data is cut off, so unpacking it would say so."""
     path = tmp_path / "a.png"

@@ -64,6 +64,15 @@ def lit_banks():
     return both_banks(dataclasses.replace(road, recordings=tuple(drives)))
 
 
+@pytest.fixture(scope="module")
+def large_banks():
+    """Frames twice as large as their crop, in which paint reaches further beside the canvas."""
+    road = recorded_road()
+    view = dataclasses.replace(road.view, width_px=2 * road.view.width_px, height_px=2 * road.view.height_px)
+    drives = [dataclasses.replace(each, frames=each.frames.repeat(2, 1).repeat(2, 2)) for each in road.recordings]
+    return both_banks(dataclasses.replace(road, view=view, recordings=tuple(drives)))
+
+
 def poses_of(states):
     rows = [(state.x_m - CANVAS.x_m, state.y_m - CANVAS.y_m, state.yaw_rad) for state in states]
     return Poses(*torch.tensor(rows, dtype=torch.float64).T)
@@ -87,7 +96,7 @@ def test_pictures_are_the_same_but_for_a_level_in_a_pixel_of_many(banks):
     assert (apart > 0).float().mean() < 1e-4
 
 
-@pytest.mark.parametrize("which", ["banks", "lit_banks"])
+@pytest.mark.parametrize("which", ["banks", "lit_banks", "large_banks"])
 @pytest.mark.parametrize("shape", [Shape.RECTANGLE, Shape.TRIANGLE])
 def test_paint_is_the_same(which, shape, request):
     # Painted in the same pictures: a level that differs is no matter here.

@@ -66,6 +66,8 @@ def at(name, index, value):
         ({"dt_s": 0.0}, "dt_s"),
         ({"dt_s": float("nan")}, "dt_s"),
         ({"dt_s": 1.5}, "dt_s"),
+        # Within half a second lie as many steps that a log may have lost as memory cannot hold.
+        ({"dt_s": 1e-12}, "dt_s of the track is 1e-12, expected 0.001 to 1 seconds"),
         ({"step": np.zeros(0, int)}, "no step"),
         ({"step": np.array([[3, 4, 5], [8, 9, 12]])}, "step of the track has shape"),
         ({"x_m": np.zeros(5)}, "x_m of the track has shape"),

@@ -164,7 +164,11 @@ def test_jobs_of_the_plan_that_have_no_row_yet_are_missing(finished, tmp_path):
     whole = rows[rows["error"].isna()]
     asked = [JobId(*each) for each in whole[list(JobId._fields)].drop_duplicates().itertuples(index=False)]
     plan = {"format": "roadproof-study-run", "version": 1, "reference": None}
-    for name, jobs in (("whole", asked), ("begun", [*asked, JobId("left-39", "7", "CMA", 3)]), ("wrong", [["left-39"]])):
+    for name, jobs in (
+        ("whole", asked),
+        ("begun", [*asked, JobId("left-39", "7", "CMA", 3)]),
+        ("wrong", [["left-39"]]),
+    ):
         (tmp_path / name).mkdir()
         (tmp_path / name / "jobs").symlink_to(folder / "jobs")
         (tmp_path / name / "study.json").write_text(json.dumps(plan | {"jobs": jobs}))

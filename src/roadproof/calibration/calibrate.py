@@ -294,7 +294,8 @@ def _check(drive: Drive, geometry: Geometry) -> None:
         first = next(iter(geometry.dropped.values()))
         raise CalibrationError(
             f"drive {drive.name} has {left} of {count} frames left after calibration (first reason: {first}); record "
-            "nearer to the canvas (a smaller horizon), or choose another method or scenario"
+            "nearer to the canvas (a smaller horizon), check camera model, poses and where the canvas lies, or choose "
+            "another method or scenario"
         )
     error = float(np.mean(geometry.residuals_px)) if geometry.residuals_px.size else 0.0
     if error > WORST_PX:

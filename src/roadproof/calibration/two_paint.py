@@ -17,6 +17,8 @@ from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
 from roadproof.simulators.protocol import PatternImage, uniform
 
 LEAST_PX = 20
+MOST_ASTRAY = 0.5
+"""A frame of whose canvas more is seen beside where its pose has it is another's: no edge is near to measure by."""
 
 
 def dark_target() -> PatternImage:
@@ -67,11 +69,14 @@ def look_at_paints(
         maps = pixel_maps_from_two_paints(torch.tensor(light), torch.tensor(black))
     except ColourError as error:
         raise CalibrationError(f"drive {drive.name}: {error}") from None
-    seen_px = maps.visible.sum((1, 2))
+    visible = maps.visible.numpy()
+    seen_px, astray_px = visible.sum((1, 2)), (visible * (share < 0.01)).sum((1, 2))
     dropped = {
-        k: f"{float(seen_px[k]):.0f} pixels of the canvas are visible, {LEAST_PX} needed"
-        for k in range(len(seen_px))
-        if seen_px[k] < LEAST_PX
+        k: f"{seen:.0f} pixels of the canvas are visible, {LEAST_PX} needed"
+        if seen < LEAST_PX
+        else f"{astray / seen:.0%} of what is seen of the canvas lies where the pose has none of it"
+        for k, (seen, astray) in enumerate(zip(seen_px.tolist(), astray_px.tolist(), strict=True))
+        if seen < LEAST_PX or astray > MOST_ASTRAY * seen
     }
     found = {k: homography for k, homography in enumerate(homographies) if k not in dropped}
     kept = list(found)

@@ -10,7 +10,15 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.coverage import Footprints, Shape, axis_rows, canvas_share, footprint_variance, polygon_vertices
+from roadproof.coverage import (
+    Footprints,
+    Shape,
+    axis_rows,
+    canvas_share,
+    footprint_px,
+    footprint_variance,
+    polygon_vertices,
+)
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
@@ -235,7 +243,8 @@ def canvas_pixels(
         centre = mapped[..., :2] / mapped[..., 2:]
         inside = (mapped[..., 2] > 0) & ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(-1)
     pictures = torch.from_numpy(inside.reshape(-1, view.height_px, view.width_px))
-    touches = dilated(pictures).numpy().reshape(inside.shape) & (mapped[..., 2] > 0)
+    touches = dilated(pictures, footprint_px(footprint_variance(view))).numpy().reshape(inside.shape)
+    touches &= mapped[..., 2] > 0
     if not touches.any():
         raise GeometryError("no frame shows the canvas; check the homographies, or record nearer to it")
     frame, pixel = np.nonzero(touches)
@@ -245,15 +254,16 @@ def canvas_pixels(
     return frame * (view.height_px * view.width_px) + pixel, seen, jacobian
 
 
-def dilated(mask: Bool[Tensor, "f h w"]) -> Bool[Tensor, "f h w"]:
-    """A mask grown by one pixel to every side: as far as the widest filter reaches."""
-    wide = mask.clone()
-    wide[:, :, 1:] |= mask[:, :, :-1]
-    wide[:, :, :-1] |= mask[:, :, 1:]
-    grown = wide.clone()
-    grown[:, 1:] |= wide[:, :-1]
-    grown[:, :-1] |= wide[:, 1:]
-    return grown
+def dilated(mask: Bool[Tensor, "f h w"], count: int) -> Bool[Tensor, "f h w"]:
+    """A mask grown by so many pixels to every side."""
+    for _ in range(count):
+        wide = mask.clone()
+        wide[:, :, 1:] |= mask[:, :, :-1]
+        wide[:, :, :-1] |= mask[:, :, 1:]
+        mask = wide.clone()
+        mask[:, 1:] |= wide[:, :-1]
+        mask[:, :-1] |= wide[:, 1:]
+    return mask
 
 
 def camera_points(index: Int[Tensor, "*n"], view: CropResize) -> Float[Tensor, "*n 2"]:

@@ -32,6 +32,7 @@ from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import in_one_line
+from roadproof.io.identity import digest
 
 InputShapes = dict[str, tuple[int | None, ...]]
 
@@ -101,6 +102,8 @@ class TorchProgram(nn.Module):
         try:
             with _pickles_refused(), _quiet():
                 program = torch.export.load(path)
+                self.identity = digest(str(program.graph))
+                """A hash of all but the weights."""
                 program = move_to_device_pass(program, device)
                 wanted = program.graph_signature.user_inputs
                 for node in program.graph.nodes:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from roadproof.controllers.onnx_operators import DTYPES, OPERATORS, SEVERAL_OUTPUTS
 from roadproof.errors import ControllerError
 from roadproof.foreign import in_one_line
+from roadproof.io.identity import digest
 
 _OLDEST_OPERATOR_SET = 13
 
@@ -77,6 +78,8 @@ class OnnxGraph(nn.Module):
         kinds = {value.name: DTYPES.get(value.type.tensor_type.elem_type) for value in graph.input}
         self.whole = {name for name, kind in kinds.items() if kind is None or not kind.is_floating_point}
         """Inputs that are whole numbers."""
+        self.identity = digest(*map(_without_notes, graph.node))
+        """A hash of all but the constants, which are buffers."""
         nodes: list[_Node] = []
         for node in graph.node:
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
@@ -129,6 +132,16 @@ class OnnxGraph(nn.Module):
         output = values[self.output]
         assert output is not None
         return output
+
+
+def _without_notes(node: Any) -> bytes:  # noqa: ANN401
+    """A node without what its exporter notes of where it comes from."""
+    bare = type(node)()
+    bare.CopyFrom(node)
+    for note in ("doc_string", "metadata_props", "name"):
+        if note in bare.DESCRIPTOR.fields_by_name:
+            bare.ClearField(note)
+    return bare.SerializeToString(deterministic=True)
 
 
 def _with_spent_values(nodes: list[_Node], keep: str) -> tuple[_Node, ...]:

@@ -22,6 +22,7 @@ from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.controllers.waypoint import WAYPOINT_CRUISE, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError
 from roadproof.io.files import AnyPath, as_path, write_tensors
+from roadproof.io.text import text_of
 
 _METADATA_KEY = "roadproof"
 
@@ -198,8 +199,8 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
 
 def _is_card(path: Path) -> bool:
     try:
-        return CARD_FORMAT in path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        return path.is_file() and CARD_FORMAT in text_of(path)
+    except (OSError, ValueError):
         return False
 
 
@@ -211,8 +212,8 @@ def card_beside(path: Path) -> ControllerCard | None:
     """
     card = path.with_suffix(".json")
     try:
-        return read_card(card.read_text(encoding="utf-8"), str(card)) if card.is_file() else None
-    except (OSError, UnicodeDecodeError) as error:
+        return read_card(text_of(card), str(card)) if card.is_file() else None
+    except (OSError, ValueError) as error:
         raise ControllerError(f"cannot read the card {card}: {error}") from error
 
 

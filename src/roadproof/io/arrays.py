@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import struct
 import tokenize
 import zipfile
 import zlib
@@ -39,6 +40,7 @@ DAMAGE = (
     OSError,
     OverflowError,
     RuntimeError,  # as NotImplementedError and RecursionError are
+    struct.error,
     SyntaxError,
     TypeError,
     ValueError,

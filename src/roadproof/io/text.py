@@ -19,7 +19,13 @@ _LONGEST_TEXT = 1000
 _MOST_DIGITS = 20
 
 
-def _text_of(path: Path, most_bytes: int) -> str:
+def text_of(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
+    """The text of a file, where it has no more bytes.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is larger, or not UTF-8.
+    """
     with open_file(path) as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
@@ -92,7 +98,7 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
             characters, or with a NUL; the message names it.
     """
     try:
-        content = tomllib.loads(_text_of(path, MOST_TEXT_BYTES))
+        content = tomllib.loads(text_of(path, MOST_TEXT_BYTES))
         odd = next((text for text in _texts(content) if len(text) > _LONGEST_TEXT or "\0" in text), None)
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
@@ -132,7 +138,7 @@ def read_json(
         error: the file is missing, is no JSON object (`parse_json`), or is of another format or a newer version.
     """
     try:
-        content = parse_json(_text_of(path, most_bytes))
+        content = parse_json(text_of(path, most_bytes))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}") from None
     except (MemoryError, ValueError, RecursionError) as reason:

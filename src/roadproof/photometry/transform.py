@@ -148,6 +148,7 @@ def _shading_from_dict(fields: dict[str, Any]) -> RadialShading:
 
 def _numbers(fields: dict[str, Any], name: str, *shape: int) -> Tensor:
     value = torch.tensor(fields[name], dtype=torch.float64)
-    if tuple(value.shape) != shape or not bool(value.isfinite().all()):
+    # Pictures are computed in single precision, in which the largest of double are infinite.
+    if tuple(value.shape) != shape or not bool(value.float().isfinite().all()):
         raise ColourError(f"{name} of a colour transform is {fields[name]}, expected finite numbers of shape {shape}")
     return value

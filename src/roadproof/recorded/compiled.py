@@ -19,7 +19,7 @@ from torch import Tensor
 from roadproof.compiling import Kernel, inline, run
 from roadproof.compositing.tents import interval_share
 from roadproof.compositing.view import OwnViews
-from roadproof.coverage import MIN_VARIANCE, Footprints
+from roadproof.coverage import MIN_VARIANCE, Footprints, footprint_px
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.photometry import Response
 from roadproof.recorded.light import Light
@@ -85,7 +85,7 @@ def lit_canvas(
     many, width = len(frames), frames.shape[-1]
     touches = torch.zeros(many, rows.stop - rows.start, width, dtype=torch.uint8)
     canvas, source = canvas_from_input.float().contiguous(), source.float().contiguous()
-    run(_find, (canvas, rows.start, touches), many, worth=WORTH)
+    run(_find, (canvas, rows.start, footprint_px(variance), touches), many, worth=WORTH)
     most = int(touches.sum((1, 2)).max())
     if most == 0:
         return None
@@ -180,15 +180,15 @@ def _draw(levels, frame, source, horizon_row, row, drawn, beyond, part):
 
 @Kernel
 @no_type_check
-def _find(canvas, top, touches, r):
+def _find(canvas, top, reach, touches, r):
     """Mark the pixels whose footprint may touch the canvas: those on it, and those beside them."""
     rows, width = touches.shape[1], touches.shape[2]
     for y in range(rows):
         for x in range(width):
             at_x, at_y, depth = _on_canvas(canvas, r, np.float32(x), np.float32(y + top))
             if depth > _ZERO and max(abs(at_x - _MIDDLE), abs(at_y - _MIDDLE)) < _REACH:
-                for beside_y in range(max(y - 1, 0), min(y + 2, rows)):
-                    for beside_x in range(max(x - 1, 0), min(x + 2, width)):
+                for beside_y in range(max(y - reach, 0), min(y + reach + 1, rows)):
+                    for beside_x in range(max(x - reach, 0), min(x + reach + 1, width)):
                         touches[r, beside_y, beside_x] = 1
     for y in range(rows):
         for x in range(width):

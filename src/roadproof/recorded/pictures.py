@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from roadproof.compositing.view import OwnViews, dilated, picked_pixels
-from roadproof.coverage import Footprints, footprint_variance
+from roadproof.coverage import Footprints, footprint_px, footprint_variance
 from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.photometry.responses import response_on
@@ -294,7 +294,7 @@ class FrameBank:
         seen = mapped[:, :2] / depth[:, None]
         middle = (CANVAS_SIZE_PX - 1) / 2
         inside = ((seen - middle).abs_().amax(1) < CANVAS_SIZE_PX / 2) & ahead
-        touches = dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
+        touches = dilated(inside.view(len(inside), -1, width), self._reach_px).flatten(1) & ahead
         packed = all_pixels(touches) if self._replayed else packed_pixels(touches)
         if packed is None:
             return None
@@ -317,6 +317,10 @@ class FrameBank:
         """The rows that show the ground; None if none does."""
         return slice(self.horizon_row, self.view.height_px) if self.horizon_row < self.view.height_px else None
 
+    @property
+    def _reach_px(self) -> int:
+        return footprint_px(footprint_variance(self.view))
+
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
         """The range of rows in which every picture has its canvas; None if no picture has one."""
         if self.camera.lens is not None:  # Its edges are curves, which corners do not bound.
@@ -329,7 +333,9 @@ class FrameBank:
         top = float(torch.where(ahead, row, last).min())
         # What reaches behind the camera leaves the picture at its lower edge.
         bottom = float(torch.where(ahead, row, last).max())
-        rows = (min(max(math.floor(top) - 1, self.horizon_row), last), min(max(math.ceil(bottom) + 2, 0), last))
+        reach = self._reach_px
+        first = min(max(math.floor(top) - reach, self.horizon_row), last)
+        rows = (first, min(max(math.ceil(bottom) + 1 + reach, 0), last))
         return slice(*rows) if rows[0] < rows[1] else None
 
 

@@ -16,6 +16,9 @@ from roadproof.io.records import check_arrays
 FASTEST_MPS = 70.0
 """No car of a recording moves faster between two steps: a pose that jumps further is wrong."""
 
+SHORTEST_S = 1e-3
+"""No recording has shorter steps; gaps between known ones, which are filled, are told in seconds."""
+
 
 _RANGES = (
     ("steer", -1, 1),
@@ -33,7 +36,7 @@ class Track:
     """The n steps of a drive whose poses are known.
 
     Args:
-        dt_s: seconds from one step to the next.
+        dt_s: seconds from one step to the next, from `SHORTEST_S` to 1.
         step: numbers of the steps, rising, (n,); of a number that is left out, nothing is known.
         x_m: world x of the vehicle's origin at each step, metres, (n,).
         y_m: world y of the vehicle's origin at each step, metres, (n,).
@@ -58,8 +61,8 @@ class Track:
     brake: Float[np.ndarray, "..."]
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.dt_s <= 1.0:
-            raise RecordingError(f"dt_s of the track is {self.dt_s}, expected seconds above 0 and at most 1")
+        if not SHORTEST_S <= self.dt_s <= 1.0:
+            raise RecordingError(f"dt_s of the track is {self.dt_s}, expected {SHORTEST_S:g} to 1 seconds")
         count = self.step.size
         if count == 0:
             raise RecordingError("the track has no step, expected at least one")
