@@ -14,10 +14,6 @@ import type_checks
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# A shell that runs the tests in the background has them ignore Ctrl-C, by whose exception some of them end.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
 # Before any test imports roadproof.
 type_checks.install()
 
@@ -87,15 +83,17 @@ def invoke(monkeypatch, capsys):
             main()
         return stopped.value.code or 0, capsys.readouterr()
 
-    # A command's Ctrl-C kills the processes beside it; tests that come after in this process interrupt theirs.
-    before = signal.getsignal(signal.SIGINT)
-    yield call
-    signal.signal(signal.SIGINT, before)
+    return call
 
 
 def pytest_runtest_setup() -> None:
-    """Check the first calls of every function in this test, too."""
+    """Check the first calls of every function in this test, too, and let Ctrl-C raise its exception in it.
+
+    A shell that runs the tests in the background has them ignore it, and a command that a test before called here in
+    this process ends the processes beside it.
+    """
     type_checks.begin_test()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -58,7 +58,7 @@ def test_arrays_that_do_not_fit_are_refused(changes, message):
 
 
 def test_missing_damaged_and_foreign_files_are_refused(tmp_path):
-    with pytest.raises(TrainingError, match="is missing; collect it again"):
+    with pytest.raises(TrainingError, match="is missing; the same command collects it again"):
         Shard.load(tmp_path / "none.npz")
     (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 and no more")
     with pytest.raises(TrainingError, match="damaged"):

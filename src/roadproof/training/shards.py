@@ -83,6 +83,6 @@ Shard.FILE = RecordFile(
     name="roadproof-shard",
     version=2,
     error=TrainingError,
-    remedy="remove it, and the same command collects it again",
+    remedy="the same command collects it again once no such file is there",
     level=1,
 )
