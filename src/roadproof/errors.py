@@ -24,6 +24,10 @@ class RecordingError(RoadproofError, ValueError):
     """A recording on disk is incomplete, damaged or inconsistent."""
 
 
+class CanvasNotReachedError(RecordingError):
+    """A car never comes to the canvas that is to be recorded, or not unharmed."""
+
+
 class EpisodeError(RoadproofError, ValueError):
     """A driven episode, or its file, is incomplete, damaged or inconsistent."""
 

@@ -359,15 +359,16 @@ def test_constants_move_with_the_module_and_are_cast_with_it(tmp_path):
 
 
 def test_graphs_of_equal_weights_are_told_apart(tmp_path):
-    def known(nodes, name):
+    def known(nodes, name, output="y"):
         (tmp_path / name).mkdir()
-        return known_by(
-            OnnxGraph(written(model(nodes, [("x", np.ones((1, 3)))], constants={"w": np.ones(3)}), tmp_path / name))
-        )
+        made = model(nodes, [("x", np.ones((1, 3)))], output, constants={"w": np.ones(3)})
+        return known_by(OnnxGraph(written(made, tmp_path / name)))
 
     add = helper.make_node("Add", ["x", "w"], ["sum"], doc_string="where it comes from")
     plain = known([add, helper.make_node("Identity", ["sum"], ["y"])], "plain")
     assert known([add, helper.make_node("Relu", ["sum"], ["y"])], "cut") != plain
+    several = [add, helper.make_node("Relu", ["sum"], ["y"]), helper.make_node("Abs", ["sum"], ["z"])]
+    assert known(several, "first") != known(several, "second", "z")
     noted = helper.make_node("Add", ["x", "w"], ["sum"], name="added", doc_string="from elsewhere")
     assert known([noted, helper.make_node("Identity", ["sum"], ["y"])], "noted") == plain
 

@@ -113,12 +113,13 @@ def test_a_card_beside_weights_counts_also_where_the_architecture_is_named(tmp_p
         load_controller(path)
 
 
-def test_a_card_is_read_within_bounds_and_from_a_file(tmp_path, monkeypatch):
+def test_a_card_is_read_within_bounds_and_from_a_file(tmp_path):
     path = tmp_path / "net.safetensors"
     save_file(pilotnet_controller().network.state_dict(), path)
-    os.mkfifo(path.with_suffix(".json"))
-    assert load_controller(f"pilotnet:{path}").cruise.target_mps == 6.0, "nobody writes into that pipe"
-    path.with_suffix(".json").unlink()
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(path.with_suffix(".json"))
+        assert load_controller(f"pilotnet:{path}").cruise.target_mps == 6.0, "nobody writes into that pipe"
+        path.with_suffix(".json").unlink()
     path.with_suffix(".json").write_text(" " * (MOST_TEXT_BYTES + 1))
     with pytest.raises(ControllerError, match=r"cannot read the card .*net\.json: it is larger than 33,554,432 bytes"):
         load_controller(path)

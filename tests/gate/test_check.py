@@ -17,7 +17,7 @@ from roadproof.controllers import load_controller
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import CheckError, RecordingError
+from roadproof.errors import CanvasNotReachedError, CheckError, RecordingError
 from roadproof.gate.check import architecture_of, run_check
 from roadproof.gate.places import places_of
 from roadproof.gate.plan import load_check
@@ -227,11 +227,13 @@ def test_a_check_of_fewer_patterns_leaves_none_of_those_before(team, tmp_path):
         (team / name).write_text(plan.replace("seeds = [0, 1]", "seeds = [0, 1, 2]") + "random = { left_lane = 1.0 }\n")
     run_check(load_check(team / "random.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
     patterns = tmp_path / "patterns/test-road/clear-noon"
-    (patterns / "mine.json").write_text("mine")
+    for name in ("mine.json", "random-cars.json"):
+        (patterns / name).write_text("mine")
     run_check(load_check(team / "fewer.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
     assert sorted(path.name for path in patterns.glob("*.json")) == [
         "mine.json",
         *(f"random-{seed}-{k}.json" for seed in range(3) for k in (1, 2)),
+        "random-cars.json",
     ]
 
 
@@ -244,7 +246,7 @@ def test_an_attack_that_cannot_be_made_is_a_case_with_its_reason(team, tmp_path,
     (team / "standing.toml").write_text(plan)
 
     def never_seen(*_, **__):
-        raise RecordingError("drive clean of left-03 never sees 60 pixels of the canvas")
+        raise CanvasNotReachedError("drive clean of left-03 never sees 60 pixels of the canvas")
 
     monkeypatch.setattr("roadproof.gate.check.stress_test", never_seen)
     plan = load_check(team / "standing.toml", budget="full", trust=True)
@@ -408,10 +410,17 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     # Not even the first result, passed or not, is made where the references are.
     code, said = invoke("check", "loose.toml", "--trust", "--out", "kept/smoke", "--accept")
     assert (code, "kept for a reference" in said.err) == (2, True)
-    # Nor where its patterns would be stored ones.
+    # Nor where its patterns would be stored ones, which stay.
+    (team / "drives" / "mine").mkdir(parents=True)
+    (team / "drives" / "mine" / "film.mp4").write_text("mine")
+    (team / "patterns" / "test-road" / "random-0-1.json").write_bytes(
+        (team / "patterns" / "test-road" / "green.json").read_bytes()
+    )
     for out in (".", "patterns/test-road", "patterns/test-road/out"):
         code, said = invoke("check", "loose.toml", "--trust", "--out", out)
         assert (code, "among the plan's patterns" in said.err) == (2, True), said.err
+    assert (team / "drives" / "mine" / "film.mp4").read_text() == "mine"
+    (team / "patterns" / "test-road" / "random-0-1.json").unlink()
     code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path, "--accept")
     assert code == 0, said.err
     assert (team / "kept/smoke/check.json").read_bytes() == (tmp_path / "check.json").read_bytes()

@@ -95,6 +95,15 @@ def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_sma
     assert max(training_step(RampNet().eval(), batch).item() for batch in seen) > 0
 
 
+def test_a_loss_that_is_a_root_is_none_that_cannot_be_learnt_from():
+    def root(model, batch):
+        answer = model.steer(batch.frames, batch.speed_mps, batch.command)
+        return (answer - batch.target[:, 0]).square().mean().sqrt()
+
+    same = RampNet().eval()
+    require_loss(root, same, same, size=RampNet.input_size, device="cpu")
+
+
 def written_over(model, batch):
     kept = model.bias.exp()
     loss = kept.square()

@@ -69,6 +69,7 @@ def test_an_interrupted_study_has_the_rows_of_its_plan_and_says_which_are_not_do
 
 
 def test_a_run_that_is_refused_leaves_a_study_as_it_was(two_jobs, tmp_path):
+    pytest.importorskip("ray", reason="ray is not installed")
     run_study(two_jobs, tmp_path, counts)
     kept = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     other = dataclasses.replace(two_jobs, figures=(3,))

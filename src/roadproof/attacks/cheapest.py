@@ -253,11 +253,11 @@ def kept_cheapest(
         "pattern": digest(stated(known_by(found.pattern)))[:16],
     }
     none, path = folder / "none.json", folder / "cheapest.json"
-    if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
-        return None
     if path.exists():
         require_same(folder, "a search", FILE.content(path).get("made_of"), made_of, RoadproofError)
         return Cheapest.load(folder)
+    if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
+        return None
     less = cheapest(
         recordings,
         controller,
@@ -273,6 +273,7 @@ def kept_cheapest(
         write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
     else:
         less.save(folder, made_of)
+        none.unlink(missing_ok=True)
     return less
 
 

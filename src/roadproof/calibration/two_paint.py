@@ -71,12 +71,14 @@ def look_at_paints(
         raise CalibrationError(f"drive {drive.name}: {error}") from None
     visible = maps.visible.numpy()
     seen_px, astray_px = visible.sum((1, 2)), (visible * (share < 0.01)).sum((1, 2))
+    # Leaves that move, or cars, differ elsewhere too, and leave the canvas where it is.
+    lost = seen_px - astray_px < (1 - MOST_ASTRAY) * share.sum((1, 2))
     dropped = {
         k: f"{seen:.0f} pixels of the canvas are visible, {LEAST_PX} needed"
         if seen < LEAST_PX
         else f"{astray / seen:.0%} of what is seen of the canvas lies where the pose has none of it"
         for k, (seen, astray) in enumerate(zip(seen_px.tolist(), astray_px.tolist(), strict=True))
-        if seen < LEAST_PX or astray > MOST_ASTRAY * seen
+        if seen < LEAST_PX or (lost[k] and astray > MOST_ASTRAY * seen)
     }
     found = {k: homography for k, homography in enumerate(homographies) if k not in dropped}
     kept = list(found)

@@ -102,7 +102,8 @@ class TorchProgram(nn.Module):
         try:
             with _pickles_refused(), _quiet():
                 program = torch.export.load(path)
-                self.identity = digest(str(program.graph))
+                parts = [each for each in program.graph_module.modules() if isinstance(each, torch.fx.GraphModule)]
+                self.identity = digest(*(str(each.graph) for each in parts))
                 """A hash of all but the weights."""
                 program = move_to_device_pass(program, device)
                 wanted = program.graph_signature.user_inputs

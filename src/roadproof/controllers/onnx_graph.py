@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from roadproof.controllers.onnx_operators import DTYPES, OPERATORS, SEVERAL_OUTPUTS
 from roadproof.errors import ControllerError
 from roadproof.foreign import in_one_line
-from roadproof.io.identity import digest
+from roadproof.io.identity import digest, stated
 
 _OLDEST_OPERATOR_SET = 13
 
@@ -78,7 +78,8 @@ class OnnxGraph(nn.Module):
         kinds = {value.name: DTYPES.get(value.type.tensor_type.elem_type) for value in graph.input}
         self.whole = {name for name, kind in kinds.items() if kind is None or not kind.is_floating_point}
         """Inputs that are whole numbers."""
-        self.identity = digest(*map(_without_notes, graph.node))
+        ends = stated([[value.name for value in values] for values in (graph.input, graph.output)])
+        self.identity = digest(ends, *map(_without_notes, graph.node))
         """A hash of all but the constants, which are buffers."""
         nodes: list[_Node] = []
         for node in graph.node:

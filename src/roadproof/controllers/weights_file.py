@@ -211,10 +211,13 @@ def card_beside(path: Path) -> ControllerCard | None:
         ControllerError: the card cannot be read.
     """
     card = path.with_suffix(".json")
+    if not card.is_file():
+        return None
     try:
-        return read_card(text_of(card), str(card)) if card.is_file() else None
+        text = text_of(card)
     except (OSError, ValueError) as error:
         raise ControllerError(f"cannot read the card {card}: {error}") from error
+    return read_card(text, str(card))
 
 
 def existing(path: Path) -> Path:

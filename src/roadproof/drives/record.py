@@ -22,7 +22,7 @@ from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, 
 from roadproof.drives.trajectories import DrivePlan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
-from roadproof.errors import GeometryError, RecordingError, RoadproofError
+from roadproof.errors import CanvasNotReachedError, GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
@@ -234,7 +234,7 @@ def _perturbed(
             notes = [] if tried == 0 else [f"perturbed {share:.2f} times as much as asked, not to crash"]
             notes += [] if behind_s < math.inf else [f"ended before the canvas was passed: {episode.ending}"]
             return _drive(plan, episode, chosen, answered, right_m, calls=tried + 1, note="; ".join(notes))
-    raise RecordingError(
+    raise CanvasNotReachedError(
         f"drive {plan.name} of {settings.scenario.name} ends in {harm} before the canvas ends, {TRIES} times; "
         "ask for smaller perturbations, or choose another scenario"
     )
@@ -298,7 +298,7 @@ def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
     shows = in_view(film.states, settings.scenario.canvas, settings.camera, settings.view, settings.window.least_px)
     which = np.flatnonzero(shows)
     if which.size == 0:
-        raise RecordingError(
+        raise CanvasNotReachedError(
             f"drive {name} of {settings.scenario.name} never sees {settings.window.least_px} pixels of the canvas "
             f"within {settings.window.horizon_m:g} m; check the driver, or where the canvas lies"
         )

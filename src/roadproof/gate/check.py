@@ -13,6 +13,7 @@ None of the first four is there before all cases are judged.
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +29,7 @@ from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL
-from roadproof.errors import CalibrationError, CheckError, EpisodeError, RecordingError
+from roadproof.errors import CanvasNotReachedError, CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
 from roadproof.gate.plan import CheckPlan, Key, fresh
@@ -90,6 +91,7 @@ def run_check(
     with working_in(folder):
         clear(folder, None if plan.reference is None else plan.reference.parents[1])
         _keep_apart(folder, plan)
+        _forget(folder)
         if compare and plan.reference is not None:
             before = load_reference(plan.reference, architecture, plan)
         run = _Check(plan, controller, folder, before, device, processes, on_progress)
@@ -131,18 +133,17 @@ def clear(folder: Path, references: Path | None) -> None:
     found = [folder / name for name in OUTPUTS if (folder / name).exists()]
     if found and not ((folder / FILE).is_file() or (folder / DRIVES).is_dir()):
         raise CheckError(f"{found[0]} is no check's, without {FILE} or {DRIVES} beside it; choose another folder")
-    for path in (*found, *_besides(folder)):
+    for path in found:
         path.unlink()
 
 
-def _besides(folder: Path) -> list[Path]:
-    """The patterns and films that a check left; one of fewer would leave some of them beside its own."""
-    patterns, drives = folder / PATTERNS, folder / DRIVES
-    if not (patterns.is_dir() and drives.is_dir()):
-        return []
-    drawn = (path for name in ("random-*", "fresh-*", "not-searched-*") for path in patterns.rglob(name))
-    filmed = (path for name in (FILM, POSTER, STRIP) for path in drives.glob(f"*/{name}"))
-    return [path for path in (*drawn, *filmed) if path.is_file()]
+def _forget(folder: Path) -> None:
+    """Take away the patterns and films that an earlier check left; one of fewer would leave some beside its own."""
+    drawn = re.compile(r"(random-\d+-\d+|(fresh|not-searched)-\d+)\.(json|png)")
+    patterns = [path for path in (folder / PATTERNS).rglob("*") if drawn.fullmatch(path.name)]
+    films = [path for name in (FILM, POSTER, STRIP) for path in (folder / DRIVES).glob(f"*/{name}")]
+    for path in (*patterns, *films):
+        path.unlink()
 
 
 def _keep_apart(folder: Path, plan: CheckPlan) -> None:
@@ -272,7 +273,7 @@ class _Check:
         plan, name = self.plan, f"fresh-{seed}"
         try:
             found = self._attacked(world, scenario, seed)
-        except (RecordingError, CalibrationError, EpisodeError) as error:
+        except CanvasNotReachedError as error:
             return self._unsearched(scenario, seed, f"no attack could be made: {error}")
         path = self.folder / PATTERNS / scenario.name / f"{name}.json"
         save_pattern(found.pattern, path)

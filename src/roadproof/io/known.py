@@ -43,7 +43,7 @@ def known_by(thing: object) -> Any:  # noqa: ANN401
     what it uses of the user's modules and of its closure; lists, dicts and sets, which may grow as it is called, count
     as they were when this process was first asked. An object is known by its class with its source, and by what its
     constructor takes, where it keeps that under the same name; a dataclass by its fields; a network by its weights too.
-    Roadproof's own functions and classes have no source here: their version and their answers tell, and what an object
+    Roadproof's own functions and classes have no source here: their version and their answers tell, and what a network
     of theirs keeps as its `identity`. A path tells nothing, as a folder may be moved.
     """
     return _known(thing, _Within((), set()))
@@ -185,9 +185,9 @@ def _object(thing: Any, within: _Within, *, weights: bool = True) -> dict[str, A
             names = []
         settings = {name: kept.get(name, kept.get(f"_{name}")) for name in names}
         told["fields"] = {name: _known(value, within) for name, value in settings.items() if value is not None}
-    if _is_ours(kind) and isinstance(kept.get("identity"), str):
-        told["identity"] = kept["identity"]
     if _is_module(thing):
+        if _is_ours(kind) and "identity" in kept:
+            told["identity"] = kept["identity"]
         children = cast("Iterable[tuple[str, object]]", thing.named_children())
         told["modules"] = {name: _object(each, within, weights=False) for name, each in children}
         if weights:

@@ -75,8 +75,9 @@ def run_study(
                     write_result(job, result, folder)
                     done += 1
                     on_job(done, job, result)
-        finally:
+        except BaseException:
             write_table_so_far(jobs, folder)
+            raise
         return write_table(jobs, folder)
 
 

@@ -70,6 +70,7 @@ def transfer(
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
     # What reads and writes the table, and what is wrong with it, is missed now, not after the last drive.
+    pandas()
     before = read_transfers(folder)
     if before is not None and not {"job", "controller"} <= set(before):
         raise StudyError(f"{folder / TRANSFERRED} does not say of which jobs it is; remove it and give this again")

@@ -11,6 +11,7 @@ from roadproof.io.tables import build
 from roadproof.io.text import read_toml
 from roadproof.lens import LensModel
 from roadproof.recordings import Side
+from roadproof.recordings.track import SHORTEST_S
 
 PLAN = "drives.toml"
 
@@ -149,8 +150,8 @@ class OwnDrives:
             )
         if camera.lens is not None and self.chessboard is not None:
             raise RecordingError("[camera.lens] and [chessboard] both tell the lens; leave one of them out")
-        if not 0.0 < self.dt_s <= 1.0:
-            raise RecordingError(f"dt_s is {self.dt_s:g}, expected seconds above 0 and at most 1")
+        if not SHORTEST_S <= self.dt_s <= 1.0:
+            raise RecordingError(f"dt_s is {self.dt_s:g}, expected {SHORTEST_S:g} to 1 seconds")
 
 
 def read_plan(folder: Path) -> OwnDrives:
