@@ -158,14 +158,19 @@ def test_who_does_not_drive_well_without_paint_does_not_pass(team, tmp_path, con
     assert "worst.jpg" not in (tmp_path / "summary.md").read_text()
 
 
-def test_a_full_check_of_who_does_not_drive_well_fails_and_attacks_nothing(team, tmp_path):
-    needs.town()
-    plan = (team / "check.toml").read_text().replace('scenario_file = "scenarios.toml"\n', "")
+def full_plan(team):
+    """The team's plan with fresh attacks in a scenario of the town."""
+    plan = PLAN.replace('scenario_file = "scenarios.toml"\n', "")
     plan = plan.replace('patterns = "patterns"\n', "").replace("test-road", "left-03")
     plan = plan.replace("[smoke]\nrecordings", "[full]\n# recordings")
     plan = plan.replace("stored = { deviation_m = 0.2, left_lane = 0.0 }", "fresh = { deviation_m = 0.5 }")
     (team / "full.toml").write_text(plan)
-    result = run_check(load_check(team / "full.toml", budget="full", trust=True), Blind(), tmp_path)
+    return load_check(team / "full.toml", budget="full", trust=True)
+
+
+def test_a_full_check_of_who_does_not_drive_well_fails_and_attacks_nothing(team, tmp_path):
+    needs.town()
+    result = run_check(full_plan(team), Blind(), tmp_path)
     assert [(case.kind, case.status) for case in result.cases] == [
         (Kind.BARE, Status.FAILED),
         (Kind.FRESH, Status.TOO_FEW),
@@ -239,18 +244,12 @@ def test_a_check_of_fewer_patterns_leaves_none_of_those_before(team, tmp_path):
 
 def test_an_attack_that_cannot_be_made_is_a_case_with_its_reason(team, tmp_path, monkeypatch):
     needs.town()
-    plan = (team / "check.toml").read_text().replace('scenario_file = "scenarios.toml"\n', "")
-    plan = plan.replace('patterns = "patterns"\n', "").replace("test-road", "left-03")
-    plan = plan.replace("[smoke]\nrecordings", "[full]\n# recordings")
-    plan = plan.replace("stored = { deviation_m = 0.2, left_lane = 0.0 }", "fresh = { deviation_m = 0.5 }")
-    (team / "standing.toml").write_text(plan)
 
     def never_seen(*_, **__):
         raise CanvasNotReachedError("drive clean of left-03 never sees 60 pixels of the canvas")
 
     monkeypatch.setattr("roadproof.gate.check.stress_test", never_seen)
-    plan = load_check(team / "standing.toml", budget="full", trust=True)
-    result = run_check(plan, load_controller("pilotnet"), tmp_path)
+    result = run_check(full_plan(team), load_controller("pilotnet"), tmp_path)
     assert [(case.kind, case.status) for case in result.cases] == [
         (Kind.BARE, Status.PASSED),
         (Kind.FRESH, Status.TOO_FEW),

@@ -70,15 +70,15 @@ def look_at_paints(
     except ColourError as error:
         raise CalibrationError(f"drive {drive.name}: {error}") from None
     visible = maps.visible.numpy()
-    seen_px, astray_px = visible.sum((1, 2)), (visible * (share < 0.01)).sum((1, 2))
+    seen_px, within_px = visible.sum((1, 2)), (visible * (share >= 0.01)).sum((1, 2))
     # Leaves that move, or cars, differ elsewhere too, and leave the canvas where it is.
-    lost = seen_px - astray_px < (1 - MOST_ASTRAY) * share.sum((1, 2))
+    elsewhere = within_px < (1 - MOST_ASTRAY) * np.minimum(seen_px, share.sum((1, 2)))
     dropped = {
         k: f"{seen:.0f} pixels of the canvas are visible, {LEAST_PX} needed"
         if seen < LEAST_PX
-        else f"{astray / seen:.0%} of what is seen of the canvas lies where the pose has none of it"
-        for k, (seen, astray) in enumerate(zip(seen_px.tolist(), astray_px.tolist(), strict=True))
-        if seen < LEAST_PX or (lost[k] and astray > MOST_ASTRAY * seen)
+        else f"{1 - within_px[k] / seen:.0%} of what is seen of the canvas lies where the pose has none of it"
+        for k, seen in enumerate(seen_px.tolist())
+        if seen < LEAST_PX or elsewhere[k]
     }
     found = {k: homography for k, homography in enumerate(homographies) if k not in dropped}
     kept = list(found)

@@ -169,10 +169,10 @@ def _shown_in(out: Path) -> tuple[object, ...]:
 def _forget_pictures(out: Path) -> None:
     """Take away the film and the composites beside an evaluation, which are of other drives."""
     from roadproof.pipeline.fidelity import FIDELITY
-    from roadproof.pipeline.film import FILM, POSTER, STRIP
+    from roadproof.pipeline.film import forget_film
 
-    for name in (FILM, POSTER, STRIP, FIDELITY):
-        (out / name).unlink(missing_ok=True)
+    forget_film(out)
+    (out / FIDELITY).unlink(missing_ok=True)
 
 
 def _figures(pattern: Path, *, needed: bool) -> Pattern | None:

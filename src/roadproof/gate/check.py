@@ -41,7 +41,7 @@ from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import FILM, POSTER, STRIP, film_drives
+from roadproof.pipeline.film import STRIP, film_drives, forget_film
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
@@ -140,10 +140,10 @@ def clear(folder: Path, references: Path | None) -> None:
 def _forget(folder: Path) -> None:
     """Take away the patterns and films that an earlier check left; one of fewer would leave some beside its own."""
     drawn = re.compile(r"(random-\d+-\d+|(fresh|not-searched)-\d+)\.(json|png)")
-    patterns = [path for path in (folder / PATTERNS).rglob("*") if drawn.fullmatch(path.name)]
-    films = [path for name in (FILM, POSTER, STRIP) for path in (folder / DRIVES).glob(f"*/{name}")]
-    for path in (*patterns, *films):
+    for path in [each for each in (folder / PATTERNS).rglob("*") if drawn.fullmatch(each.name)]:
         path.unlink()
+    for scenario in (folder / DRIVES).glob("*/"):
+        forget_film(scenario)
 
 
 def _keep_apart(folder: Path, plan: CheckPlan) -> None:

@@ -12,7 +12,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartPlan
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
-from roadproof.gate.verdict import LEAST_COMPARED, Change, Kind, least_drives
+from roadproof.gate.verdict import Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
@@ -270,7 +270,9 @@ def _check_drives(plan: CheckPlan) -> None:
             (f"{name} at most {limit:g}" if name != "deviation_m" else name, least_drives(name, limit))
             for name, limit in limits.items()
         ]
-        asked += [(f"a change of {name}", LEAST_COMPARED) for name in MEASURES[kind] if name in plan.change]
+        # A case that is compared takes as many as a median, whatever is compared.
+        median = least_drives("deviation_m", 0.0)
+        asked += [(f"a change of {name}", median) for name in MEASURES[kind] if name in plan.change]
         for shown, least in asked:
             if count < least:
                 what = "random × seeds" if kind is Kind.RANDOM else "starts × seeds"

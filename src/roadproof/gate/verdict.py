@@ -71,10 +71,6 @@ def is_above(value: float, limit: float) -> bool:
     return value > limit + EQUAL
 
 
-LEAST_COMPARED = 6
-"""Drives of a case that is compared with the reference: fewer give a median no interval."""
-
-
 def median_95(values: Sequence[float]) -> Estimate:
     """The median with the exact interval that its order statistics give; it needs six values.
 
@@ -106,7 +102,7 @@ def least_drives(measure: str, limit: float) -> int:
     """
     tail = (1 - CONFIDENCE) / 2
     if measure == "deviation_m":
-        return LEAST_COMPARED
+        return math.ceil(math.log(tail) / math.log(0.5))
     # No case has more drives than the largest number here.
     return 1 if limit in (0.0, 1.0) else math.ceil(min(math.log(tail) / math.log1p(-limit), sys.maxsize))
 

@@ -104,6 +104,12 @@ class _Side:
         return step if step + self.each < self.shown else self.shown - 1
 
 
+def forget_film(folder: Path) -> None:
+    """Take away the film, poster and strip of a folder, which are of other drives; there may be none."""
+    for name in (FILM, POSTER, STRIP):
+        (folder / name).unlink(missing_ok=True)
+
+
 def film_drives(
     simulator: Simulator,
     start: Scenario,

@@ -121,28 +121,16 @@ def planned_in(folder: Path) -> Planned:
     return Planned(reference=None if name is None else str(name), jobs=asked)
 
 
-def write_table_so_far(jobs: Iterable[Job], folder: Path) -> None:
-    """Gather the rows that there are, as `write_table`; where there are none, none of an earlier plan stay.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    jobs = list(jobs)
-    if any(read_rows(job, folder) for job in jobs):
-        write_table(jobs, folder)
-    else:
-        remove(folder / "rows.parquet")
-
-
 def write_table(jobs: Iterable[Job], folder: Path) -> Frame:
     """Gather the rows of all jobs that have some, in the jobs' order, and write them as Parquet.
 
     Raises:
-        StudyError: no job has rows, or pandas and pyarrow are not installed.
+        StudyError: no job has rows, and none of an earlier plan stay; or pandas and pyarrow are not installed.
         OutputError: the file cannot be written.
     """
     rows = [row for job in jobs for row in read_rows(job, folder) or ()]
     if not rows:
+        remove(folder / "rows.parquet")
         raise StudyError(f"{folder} has no results yet; run the study first")
     frame = pandas().DataFrame(rows)
     if "error" not in frame:

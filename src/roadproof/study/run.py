@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,7 +17,7 @@ from roadproof.io.locks import own_folder, working_in
 from roadproof.machine import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
-from roadproof.study.folder import is_done, pandas, write_result, write_study, write_table, write_table_so_far
+from roadproof.study.folder import is_done, pandas, write_result, write_study, write_table
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, failed
 
@@ -67,7 +67,8 @@ def run_study(
         done = len(jobs) - len(left)
         write_study(study, jobs, folder)
         # However this run ends, the table is of this plan, and has what is there.
-        write_table_so_far(jobs, folder)
+        with suppress(StudyError):
+            write_table(jobs, folder)
         results = _on_this_machine(left, folder, work, workers) if ray is None else _on_ray(left, work, ray)
         try:
             with closing(results):
@@ -76,7 +77,8 @@ def run_study(
                     done += 1
                     on_job(done, job, result)
         except BaseException:
-            write_table_so_far(jobs, folder)
+            with suppress(StudyError):
+                write_table(jobs, folder)
             raise
         return write_table(jobs, folder)
 
