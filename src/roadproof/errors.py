@@ -24,12 +24,12 @@ class RecordingError(RoadproofError, ValueError):
     """A recording on disk is incomplete, damaged or inconsistent."""
 
 
-class CanvasNotReachedError(RecordingError):
-    """A car never comes to the canvas that is to be recorded, or not unharmed."""
-
-
 class EpisodeError(RoadproofError, ValueError):
     """A driven episode, or its file, is incomplete, damaged or inconsistent."""
+
+
+class CanvasNotReachedError(RecordingError, EpisodeError):
+    """Without paint a car never comes to the canvas, or not unharmed, so that nothing can be recorded or compared."""
 
 
 class CalibrationError(RoadproofError, RuntimeError):

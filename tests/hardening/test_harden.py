@@ -131,7 +131,7 @@ def test_a_tuning_that_spoils_the_driving_is_told_with_what_to_do(town, tmp_path
         stages_of(plan, town).rounds(number)
 
 
-def test_one_that_no_longer_drives_the_streets_for_judging_did_not_help(town, tmp_path):
+def test_one_that_no_longer_drives_a_street_for_judging_is_told_with_the_reason(town, tmp_path):
     plan, near = planned(tmp_path, TINY), street(tmp_path, "near", 15.0)
     network = load_trainable("pilotnet")
     with torch.no_grad():
@@ -139,8 +139,11 @@ def test_one_that_no_longer_drives_the_streets_for_judging_did_not_help(town, tm
             branch[-1].bias[0] = 3.0
     plan.round(1).mkdir(parents=True)
     save_controller(network, plan.weights(1), origin="spoilt")
-    with pytest.raises(TrainingError, match=r"^it did not help: hardened in round 1 the controller no longer drives a"):
-        stages_of(plan, town).judge(1, [near])
+    far = street(tmp_path, "far", 25.0)
+    judged, unjudged = stages_of(plan, town, processes=2).judge(1, [near, far])
+    assert {each.after for each in judged} == {False}, "the controller before is judged as ever"
+    assert list(unjudged) == ["near", "far"]
+    assert stages_of(plan, town).judge(1, [near, far]) == (judged, unjudged)
 
 
 def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):

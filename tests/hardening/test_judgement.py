@@ -42,12 +42,12 @@ HELPED = (
 def test_the_strongest_attack_on_each_street_is_compared():
     told = verdict(*HELPED)
     # a: 2.0 to 0.3, b: 1.5 to 0.2, c: 1.3 to 0.3, where the old pattern is the strongest.
-    assert (told.before_m, told.after_m) == pytest.approx((1.5, 0.3))
-    assert told.change_m.value == pytest.approx(-(1.7 + 1.3 + 1.0) / 3)
-    assert told.change_m.count == 3
-    assert told.change_m.high < 0
-    assert (told.outcome, told.over) == ("helped", "streets")
-    assert (told.left_lane_before, told.left_lane_after) == (1.0, 0.0)
+    assert (told.compared.before_m, told.compared.after_m) == pytest.approx((1.5, 0.3))
+    assert told.compared.change_m.value == pytest.approx(-(1.7 + 1.3 + 1.0) / 3)
+    assert told.compared.change_m.count == 3
+    assert told.compared.change_m.high < 0
+    assert (told.outcome, told.compared.over) == ("helped", "streets")
+    assert (told.compared.left_lane_before, told.compared.left_lane_after) == (1.0, 0.0)
     assert told.sentence.startswith("It helped: over the strongest attack")
     assert "0.30 m instead of 1.50 m" in told.sentence
 
@@ -57,8 +57,8 @@ def test_an_attack_that_leads_it_out_of_its_lane_by_fewer_metres_is_not_hidden()
     ellipses = judged("a", "ellipses", [1.4, 1.4], [0.28, 0.28])
     ellipses[1] = replace(ellipses[1], left_lane=(True, False))
     told = Judgement((*rows, *ellipses), (BareDrives(4, 4, ()),) * 2).verdict()
-    assert (told.left_lane_before, told.left_lane_after) == (1.0, 0.25)
-    assert told.after_m == pytest.approx(0.3)
+    assert (told.compared.left_lane_before, told.compared.left_lane_after) == (1.0, 0.25)
+    assert told.compared.after_m == pytest.approx(0.3)
     assert told.sentence.endswith("it leaves it in 25% of the drives instead of 100%.")
 
 
@@ -76,9 +76,9 @@ def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
 
 def test_one_street_has_an_interval_over_its_starts_and_one_start_has_none():
     told = verdict(("a", "k", [1.0, 1.2, 1.1], [0.1, 0.2, 0.2]))
-    assert (told.outcome, told.over, told.change_m.count) == ("helped", "starts", 3)
+    assert (told.outcome, told.compared.over, told.compared.change_m.count) == ("helped", "starts", 3)
     alone = verdict(("a", "k", [1.0], [0.1]))
-    assert (alone.outcome, alone.change_m.low) == ("not shown", None)
+    assert (alone.outcome, alone.compared.change_m.low) == ("not shown", None)
     assert "95 %" not in alone.sentence
 
 
@@ -86,18 +86,18 @@ def test_drives_from_one_start_in_several_weathers_are_not_independent():
     # Two starts, four weathers: eight drives, two of them independent.
     before, after = [1.0, 1.0] * 4, [0.5, 0.95] * 4
     told = verdict(("a", "k", before, after, ([0, 1] * 4, [0, 1] * 4)))
-    assert told.change_m.count == 2
-    assert told.change_m.value == pytest.approx(-0.275)
+    assert told.compared.change_m.count == 2
+    assert told.compared.change_m.value == pytest.approx(-0.275)
     assert told.outcome == "not shown"
 
 
 def test_starts_that_were_left_out_on_one_side_are_not_compared():
     told = verdict(("a", "k", [1.0, 1.4, 1.6, 9.0], [0.2, 0.3, 0.5], ([0, 1, 2, 3], [2, 1, 0])))
-    assert told.change_m.count == 3
-    assert told.change_m.value == pytest.approx(((0.5 - 1.0) + (0.3 - 1.4) + (0.2 - 1.6)) / 3)
+    assert told.compared.change_m.count == 3
+    assert told.compared.change_m.value == pytest.approx(((0.5 - 1.0) + (0.3 - 1.4) + (0.2 - 1.6)) / 3)
     none = verdict(("a", "k", [1.0, 1.4], [0.2], ([0, 1], [2])))
-    assert (none.outcome, none.change_m.low) == ("not shown", None)
-    assert none.change_m.value == pytest.approx(-1.0)
+    assert (none.outcome, none.compared.change_m.low) == ("not shown", None)
+    assert none.compared.change_m.value == pytest.approx(-1.0)
 
 
 def test_a_car_that_no_longer_comes_to_the_canvas_was_not_helped():
@@ -106,5 +106,25 @@ def test_a_car_that_no_longer_comes_to_the_canvas_was_not_helped():
     clean = BareDrives(4, 4, ())
     told = Judgement(tuple(kept), (clean, clean)).verdict()
     assert (told.outcome, told.lost) == ("not shown", 2)
-    assert (told.before_m, told.after_m) == pytest.approx((0.5, 0.295)), "over the starts of both"
+    assert (told.compared.before_m, told.compared.after_m) == pytest.approx((0.5, 0.295)), "over the starts of both"
     assert told.sentence.endswith("; in 2 more drives it never came to the canvas.")
+
+
+def test_a_street_that_cannot_be_judged_after_it_is_named_and_never_helped():
+    rows = tuple(each for row in HELPED for each in judged(*row)) + tuple(judged("d", "gradient", [2.0, 2.0], []))
+    clean = (BareDrives(4, 4, ()),) * 2
+    told = Judgement(rows, clean, {"d": "without paint the car never comes near the canvas of d"}).verdict()
+    assert (told.outcome, told.unjudged) == ("not shown", ("d",))
+    assert told.compared == verdict(*HELPED).compared, "the others are compared as ever"
+    assert told.sentence.endswith("; d could not be judged after it.")
+
+
+def test_where_no_street_can_be_judged_after_it_the_bare_road_decides():
+    before = tuple(judged("a", "gradient", [1.8, 2.2], []))
+    clean = BareDrives(4, 4, ())
+    told = Judgement(before, (clean, clean), {"a": "it stands"}).verdict()
+    assert (told.outcome, told.compared) == ("not shown", None)
+    assert told.sentence == "That it helped is not shown: no held-out street could be judged after it."
+    told = Judgement(before, (clean, BareDrives(4, 0, ("a, noon",) * 4)), {"a": "it stands"}).verdict()
+    assert told.outcome == "did not help"
+    assert told.sentence.endswith("judged after it; fewer drives over the bare road are clean.")

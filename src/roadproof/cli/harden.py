@@ -100,6 +100,8 @@ def harden(
         say(f"  round {each.number}: {each.mean_m:.2f} m on the streets trained on, attacked afresh{kept}")
     if found.judgement is not None:
         say(found.judgement.verdict().sentence)
+        for name, why in found.judgement.unjudged.items():
+            say(f"  {name} after it: {why}")
     say(f"The hardened controller is {found.hardened}, the page {page}")
     answer(stored(out / "hardening.json"))
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from roadproof.datatypes import Ending
 from roadproof.driving.episode import Episode
-from roadproof.errors import EpisodeError
+from roadproof.errors import CanvasNotReachedError, EpisodeError
 from roadproof.geometry import CanvasPlacement
 
 Path2D = Float[np.ndarray, "n 2"]
@@ -57,9 +57,9 @@ def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZO
     return slice(int(seen[0]), int(seen[-1]) + 1) if len(seen) else slice(nearest, nearest + 1)
 
 
-def canvas_missed(scenario: str) -> EpisodeError:
+def canvas_missed(scenario: str) -> CanvasNotReachedError:
     """The error where a drive without paint never comes to the canvas of a scenario."""
-    return EpisodeError(
+    return CanvasNotReachedError(
         f"without paint the car never comes near the canvas of {scenario}: nothing can be compared with it; choose a "
         "scenario that the controller masters"
     )

@@ -129,7 +129,8 @@ def harden(
         judgement = None
         if judge_on:
             clean = stages.drive_clean(best, clean_on or streets)
-            judgement = Judgement(stages.judge(best, judge_on), clean)
+            judged, unjudged = stages.judge(best, judge_on)
+            judgement = Judgement(judged, clean, unjudged)
         found = Hardened(
             controller=controller,
             hardened=plan.spec_with(weights),

@@ -11,7 +11,7 @@ All numbers are driven. Each kind's pattern is driven over from the same starts 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 
@@ -90,48 +90,79 @@ class BareDrives:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class HardeningVerdict:
-    """Whether hardening helped.
+class BeforeAfter:
+    """Both controllers over the strongest attack on each street.
 
     Args:
-        outcome: "helped", "did not help" or "not shown".
-        change_m: deviation after less before, metres, of the strongest attack on each street: mean with 95 % interval.
+        change_m: deviation after less before, metres: mean with 95 % interval.
         over: what the interval is over: "streets", or with one street alone the "starts" of its drives.
-        before_m: median over streets of the strongest attack's mean deviation before hardening, metres.
-        after_m: median over streets of the strongest attack's mean deviation after hardening, metres.
+        before_m: median over streets of the mean deviation before hardening, metres.
+        after_m: median over streets of the mean deviation after hardening, metres.
         left_lane_before: share of drives that leave the lane before hardening, 0 to 1, over the attack on each street
             that leads most of them out of it: not always the one of the largest deviation.
         left_lane_after: the same after hardening.
-        clean_worse: whether fewer drives over the bare road are clean after hardening.
-        lost: how many more drives than before could not be judged, since the car never came to the canvas.
     """
 
-    outcome: str
     change_m: Estimate
     over: str
     before_m: float
     after_m: float
     left_lane_before: float
     left_lane_after: float
+
+    @property
+    def better(self) -> bool:
+        """Whether all of the interval lies below no change."""
+        return self.change_m.high is not None and self.change_m.high < 0
+
+    @property
+    def worse(self) -> bool:
+        """Whether all of the interval lies above no change."""
+        return self.change_m.low is not None and self.change_m.low > 0
+
+    @property
+    def sentence(self) -> str:
+        """The comparison in words."""
+        c = self.change_m
+        between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
+        return (
+            f"over the strongest attack on held-out streets it deviates by {self.after_m:.2f} m instead of "
+            f"{self.before_m:.2f} m, {c.value:+.2f} m on average{between}; over the one that leads it out of its lane "
+            f"most often it leaves it in {self.left_lane_after:.0%} of the drives instead of "
+            f"{self.left_lane_before:.0%}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HardeningVerdict:
+    """Whether hardening helped.
+
+    Args:
+        outcome: "helped", "did not help" or "not shown".
+        compared: both controllers on the streets that could be judged after hardening; None where none could.
+        clean_worse: whether fewer drives over the bare road are clean after hardening.
+        lost: how many more drives than before could not be judged, since the car never came to the canvas.
+        unjudged: names of the streets that could not be judged after hardening.
+    """
+
+    outcome: str
+    compared: BeforeAfter | None
     clean_worse: bool
     lost: int = 0
+    unjudged: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
         """The verdict as a sentence for people."""
-        c = self.change_m
-        between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
         outcome = {"helped": "It helped", "did not help": "It did not help", "not shown": "That it helped is not shown"}
-        worse = "; fewer drives over the bare road are clean" if self.clean_worse else ""
-        worse += f"; in {self.lost} more drives it never came to the canvas" if self.lost else ""
-        paint_alone = self.clean_worse and c.high is not None and c.high < 0
+        paint_alone = self.clean_worse and self.compared is not None and self.compared.better
         begin = "It helped against paint but not on the whole" if paint_alone else outcome[self.outcome]
-        return (
-            f"{begin}: over the strongest attack on held-out streets it deviates by "
-            f"{self.after_m:.2f} m instead of {self.before_m:.2f} m, {c.value:+.2f} m on average{between}; over the "
-            f"one that leads it out of its lane most often it leaves it in {self.left_lane_after:.0%} of the drives "
-            f"instead of {self.left_lane_before:.0%}{worse}."
-        )
+        told = "no held-out street could be judged after it" if self.compared is None else self.compared.sentence
+        told += "; fewer drives over the bare road are clean" if self.clean_worse else ""
+        told += f"; in {self.lost} more drives it never came to the canvas" if self.lost else ""
+        if self.compared is not None and self.unjudged:
+            told += f"; {', '.join(self.unjudged)} could not be judged after it"
+        return f"{begin}: {told}."
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,38 +172,50 @@ class Judgement:
     Args:
         judged: every kind of attack on every street, before and after.
         clean: drives over the bare road, before and after.
+        unjudged: why the hardened controller could not be attacked or compared on a street, by the street's name, such
+            as that it no longer drives there.
     """
 
     judged: tuple[JudgedAttack, ...]
     clean: tuple[BareDrives, BareDrives]
+    unjudged: dict[str, str] = field(default_factory=dict[str, str])
 
     def verdict(self) -> HardeningVerdict:
         """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
-        names = list(dict.fromkeys(each.scenario for each in self.judged))
+        names = [name for name in dict.fromkeys(each.scenario for each in self.judged) if name not in self.unjudged]
+        compared = self._compared(names) if names else None
+        worse = self.clean[1].clean < self.clean[0].clean
         before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
-        pairs = [_compared(one, two) for one, two in zip(before, after, strict=True)]
-        if len(names) > 1:
+        lost = sum(each.left_out for each in after) - sum(each.left_out for each in before)
+        if worse or (compared is not None and compared.worse):
+            outcome = "did not help"
+        else:
+            shown = compared is not None and compared.better and lost <= 0 and not self.unjudged
+            outcome = "helped" if shown else "not shown"
+        return HardeningVerdict(
+            outcome=outcome,
+            compared=compared,
+            clean_worse=worse,
+            lost=max(lost, 0),
+            unjudged=tuple(self.unjudged),
+        )
+
+    def _compared(self, scenarios: Sequence[str]) -> BeforeAfter:
+        pairs = [
+            _from_common_starts(self._strongest(name, after=False), self._strongest(name, after=True))
+            for name in scenarios
+        ]
+        if len(scenarios) > 1:
             changes, over = [float(np.mean(two) - np.mean(one)) for one, two in pairs], "streets"
         else:
             changes, over = [two - one for one, two in zip(*pairs[0], strict=True)], "starts"
-        change = mean_95(changes)
-        worse = self.clean[1].clean < self.clean[0].clean
-        lost = sum(each.left_out for each in after) - sum(each.left_out for each in before)
-        low, high = change.low, change.high
-        if worse or (low is not None and low > 0):
-            outcome = "did not help"
-        else:
-            outcome = "helped" if high is not None and high < 0 and lost <= 0 else "not shown"
-        return HardeningVerdict(
-            outcome=outcome,
-            change_m=change,
+        return BeforeAfter(
+            change_m=mean_95(changes),
             over=over,
             before_m=float(np.median([np.mean(one) for one, _ in pairs])),
             after_m=float(np.median([np.mean(two) for _, two in pairs])),
-            left_lane_before=self._left_lane(names, after=False),
-            left_lane_after=self._left_lane(names, after=True),
-            clean_worse=worse,
-            lost=max(lost, 0),
+            left_lane_before=self._left_lane(scenarios, after=False),
+            left_lane_after=self._left_lane(scenarios, after=True),
         )
 
     def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
@@ -270,7 +313,7 @@ class StreetJudge:
         )
 
 
-def _compared(before: JudgedAttack, after: JudgedAttack) -> tuple[list[float], list[float]]:
+def _from_common_starts(before: JudgedAttack, after: JudgedAttack) -> tuple[list[float], list[float]]:
     """The deviations from the starts of both, metres; of all drives where they have none in common."""
     first, then = before.by_start(), after.by_start()
     common = [start for start in first if start in then]

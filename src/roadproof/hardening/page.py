@@ -42,7 +42,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
                 "before": _picture(folder / "round-0" / "judged" / name),
                 "after": _picture(folder / f"round-{found.best}" / "judged" / name),
             }
-            for name in dict.fromkeys(each.scenario for each in judged)
+            for name in dict.fromkeys(each.scenario for each in judged if each.after)
         ],
     )
     page = folder / "hardening.html"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -138,31 +139,27 @@ class HardeningStages:
         _save(network, plan, number)
         path.unlink(missing_ok=True)
 
-    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[JudgedAttack, ...]:
-        """Judge the controllers before and after on other streets."""
-        judged: list[JudgedAttack] = []
+    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[tuple[JudgedAttack, ...], dict[str, str]]:
+        """Judge the controllers before and after on other streets.
+
+        Returns:
+            Every kind of attack on every street, and why a street could not be judged after hardening, by its name.
+        """
+        judged, unjudged = list[JudgedAttack](), dict[str, str]()
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.
-            judged += self._judged(0, "before", judge_on)
-            try:
-                judged += self._judged(best, "after", judge_on)
-            except (EpisodeError, RecordingError) as error:
-                raise TrainingError(
-                    f"it did not help: hardened in round {best} the controller no longer drives a street for judging "
-                    f"without paint: {error}; harden with other streets, another seed or fewer rounds"
-                ) from None
+            for number, when in ((0, "before"), (best, "after")):
+                self._together(f"Judging {when}", _judge_street, number, judge_on)
+                for scenario in judge_on:
+                    told = self._under(f"Judging {when}, {scenario.name}")
+                    try:
+                        judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
+                    except (EpisodeError, RecordingError) as error:
+                        if not number:
+                            raise
+                        unjudged[scenario.name] = str(error)
             self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
-        return tuple(judged)
-
-    def _judged(self, number: int, when: str, judge_on: Sequence[Scenario]) -> list[JudgedAttack]:
-        self._together(f"Judging {when}", _judge_street, number, judge_on)
-        return [
-            each
-            for scenario in judge_on
-            for each in StreetJudge(
-                self.plan, self.simulator, number, scenario, self._under(f"Judging {when}, {scenario.name}")
-            ).judge()
-        ]
+        return tuple(judged), unjudged
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[BareDrives, BareDrives]:
         """Drive over the bare road with the controllers before and after."""
@@ -248,7 +245,9 @@ def _drive_in_town(plan: HardeningPlan, number: int, town: TownSimulator, drive:
 
 
 def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
-    StreetJudge(plan, simulator, number, scenario, _go_on).judge()
+    # What the hardened controller cannot be judged by is told where all streets are gathered.
+    with suppress(*((EpisodeError, RecordingError) if number else ())):
+        StreetJudge(plan, simulator, number, scenario, _go_on).judge()
 
 
 def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
