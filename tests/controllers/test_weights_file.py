@@ -18,7 +18,7 @@ from roadproof.controllers import (
     pilotnet_controller,
     save_controller,
 )
-from roadproof.controllers.weights_file import fill_from
+from roadproof.controllers.weights_file import ARCHITECTURES, fill_from
 from roadproof.errors import ControllerError, OutputError
 from roadproof.io.text import MOST_TEXT_BYTES
 
@@ -144,3 +144,22 @@ def test_what_cannot_be_saved_is_said(cil, tmp_path):
     with pytest.raises(OutputError, match="cannot write"):
         save_controller(cil, tmp_path / "file" / "x.safetensors")
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_file_that_says_it_is_far_larger_than_it_is_is_refused_before_the_network_takes_memory(tmp_path, monkeypatch):
+    path, made = tmp_path / "hostile.safetensors", list[str]()
+    build = ARCHITECTURES["cil"]
+
+    def watched(card):
+        made.append(torch.empty(0).device.type)
+        return build(card)
+
+    monkeypatch.setitem(ARCHITECTURES, "cil", watched)
+    save_controller(CIL(width=1 / 32), path)
+    fits = dict(load_file(path))
+    assert isinstance(load_controller(str(path)), CIL)
+    assert made == ["meta", "cpu"]
+    save_file(fits, path, {"roadproof": ControllerCard(architecture="cil", width=8.0).to_json()})
+    with pytest.raises(ControllerError, match=r"has shape .* for this CIL"):
+        load_controller(str(path))
+    assert made == ["meta", "cpu", "meta"]

@@ -154,8 +154,11 @@ def from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
             f"{path} says {found} about its architecture; write {' or '.join(f'{a}:{path}' for a in ARCHITECTURES)}, "
             f"or put a card beside it as {path.with_suffix('.json').name}"
         )
+    # A card may ask for gigabytes that its file does not hold.
+    with torch.device("meta"):
+        _check_shapes(_network_of(ARCHITECTURES[card.architecture](card)), state, path)
     made = ARCHITECTURES[card.architecture](card)
-    _fill(made.network if isinstance(made, NetworkController) else made, state, path)
+    _fill(_network_of(made), state, path)
     return made
 
 
@@ -179,9 +182,13 @@ def _read(path: Path) -> tuple[dict[str, Shaped[Tensor, "..."]], str | None]:
     return state, metadata.get(_METADATA_KEY)
 
 
-def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Path) -> None:
-    expected = network.state_dict()
-    name = type(network).__name__
+def _network_of(made: CIL | ConditionalPilotNet | NetworkController) -> nn.Module:
+    return made.network if isinstance(made, NetworkController) else made
+
+
+def _check_shapes(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Path) -> None:
+    """Refuse tensors of other names or shapes than the network's, which needs no numbers for it."""
+    expected, name = network.state_dict(), type(network).__name__
     for key in sorted(expected.keys() ^ state.keys()):
         fault = "lacks" if key in expected else "has an unexpected"
         raise ControllerError(f"{path} {fault} tensor {key}; is it really a {name}?")
@@ -189,6 +196,12 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
         if tensor.shape != expected[key].shape:
             shapes = f"{tuple(tensor.shape)}, expected {tuple(expected[key].shape)}"
             raise ControllerError(f"{path}: tensor {key} has shape {shapes} for this {name}")
+
+
+def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Path) -> None:
+    _check_shapes(network, state, path)
+    expected = network.state_dict()
+    for key, tensor in state.items():
         if tensor.is_floating_point() != expected[key].is_floating_point():
             raise ControllerError(f"{path}: tensor {key} is of type {tensor.dtype}, expected {expected[key].dtype}")
         # Of numbers of 8 bits torch does not tell. A mask of a network's own may be infinite.
