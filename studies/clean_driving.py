@@ -107,8 +107,8 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
     with Progress() as bar:
         for controller in controllers:
             now = digest(shipped_weights(controller).read_bytes())[:16]
-            if weights.setdefault(controller, now) != now:
-                drives.pop(controller, None)  # of other weights of this name
+            if weights.get(controller) != now:
+                drives.pop(controller, None)  # of other weights of this name, or nobody knows of which
                 weights[controller] = now
             for name, wanted in conditions().items():
                 if name not in names:

@@ -14,6 +14,7 @@ import torch
 import bad_drivers
 import needs
 from paint_shy import PaintShy, along_a_street, magenta
+from roadproof.controllers import load_controller
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
 from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, driver_in_words, load_episodes
@@ -22,11 +23,13 @@ from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
-from roadproof.driving.starts import StartOffset, StartPlan, StartRange
+from roadproof.driving.starts import StartOffset, StartPlan, StartRange, require_on_road
 from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.stress_test import stress_test
 from roadproof.roads.maps import builtin_map_file
-from roadproof.scenarios import find_scenario, identity
+from roadproof.scenarios import builtin_scenarios, find_scenario, identity
 
 needs.town()
 from roadproof.simulators.protocol import world_of
@@ -278,11 +281,31 @@ def stands(_simulator):
     return lambda _seen: Control(0.0, brake=1.0)
 
 
-@pytest.mark.parametrize("wrong", [{"right_m": 1.5}, {"turned_rad": -0.1}, {"faster_mps": math.nan}], ids=str)
-def test_starts_off_the_lane_are_refused(wrong):
+WRONG_STARTS = [{"right_m": 1.5}, {"turned_rad": -0.1}, {"faster_mps": math.nan}]
+
+
+@pytest.mark.parametrize("wrong", WRONG_STARTS, ids=str)
+def test_starts_off_any_road_are_refused(wrong):
     name, value = next(iter(wrong.items()))
-    with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
+    with pytest.raises(EpisodeError, match=f"{name} of the starts is {value!r}, expected a number from 0 to"):
         StartRange(**wrong)
+
+
+def test_starts_off_the_road_that_is_driven_are_refused_before_anything_is(town, tmp_path):
+    scenario, wide = find_scenario("straight-02"), StartRange(right_m=1.0, turned_rad=0.3)
+    with pytest.raises(EpisodeError, match=r"starts of straight-02 reach 1 m to the .* where a wheel is off"):
+        evaluate(town, PaintShy(), scenario, MAGENTA, folder=tmp_path / "out", starts=1, start_range=wide)
+    with pytest.raises(EpisodeError, match="where a wheel is off the road"):
+        stress_test(
+            town,
+            load_controller("pilotnet"),
+            scenario,
+            tmp_path / "out",
+            budget=dataclasses.replace(QUICK, starts=1, start_range=wide),
+        )
+    assert not (tmp_path / "out").exists()
+    for each in builtin_scenarios():
+        require_on_road(StartRange(), each, town)
 
 
 def test_a_range_of_minus_nothing_is_one_of_nothing():

@@ -116,7 +116,7 @@ MISTAKES = {
         (SEEDED + RANGE, SEEDED.replace("1", "6") + "right_m = 0.001\nturned_rad = 0.0\nfaster_mps = 0.0"),
         "starts has 5 that differ among the 6 drawn",
     ),
-    "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m of the starts is 3.0, expected 0 to 1"),
+    "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m of the starts is 3.0, expected a number from 0 to 1"),
     "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected a whole number from 0 to"),
     "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
     "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),

@@ -325,7 +325,7 @@ def test_the_paper_s_study_is_the_paper_s():
         (PublishedPlan, {"noise_deg": (99, 3)}, "steering noise is 99…3°"),
         (BlackBoxPlan, {"search": "luck"}, "method is 'luck'"),
         (TrafficPlan, {"cars": 0, "pedestrians": 0}, "leave .traffic. out"),
-        (StartPlan, {"right_m": 2.0}, "right_m of the starts is 2.0, expected 0 to 1"),
+        (StartPlan, {"right_m": 2.0}, "right_m of the starts is 2.0, expected a number from 0 to 1"),
         (StartPlan, {"count": 0}, "count is 0, expected 1 to 1000"),
     ],
 )

@@ -15,7 +15,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.deviation import canvas_missed
 from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Episodes, driver_in_words, make_missing
 from roadproof.driving.evaluation import ATTACK, Evaluation
-from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
+from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange, require_on_road
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
@@ -75,8 +75,8 @@ def evaluate(
         on_drive: called after each drive with the number of drives done and of all drives.
 
     Raises:
-        EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, a drive in the
-            folder is damaged, or no drive alone without paint comes to the canvas.
+        EpisodeError: there is nothing to drive, the starts reach off the road, several processes are asked for with an
+            open simulator, a drive in the folder is damaged, or no drive alone without paint comes to the canvas.
         ControllerError: the driver raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator refuses the conditions, or a process died.
         OutputError: the folder cannot be written.
@@ -95,6 +95,8 @@ def evaluate(
     with ExitStack() as stack:
         world = stack.enter_context(simulator()) if callable(simulator) else simulator
         scenario = begun_in(world, scenario)
+        if starts:
+            require_on_road(start_range, scenario, world)
         episodes = Episodes.of(world, driver, scenario, paints, folder)
         planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))

@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from roadproof.errors import EpisodeError
 from roadproof.io.tables import check_range
 from roadproof.limits import check_seed
+from roadproof.roads.maps import Mapped
+from roadproof.roads.roadmap import Surface
 from roadproof.scenarios import Scenario
+from roadproof.simulators.tracker.judge import wheels
 
 MOST = {"right_m": 1.0, "turned_rad": 0.3, "faster_mps": 5.0}
-"""Further aside or more turned a car stands over its lane's edge or looks off the road."""
+"""Further aside or more turned a car looks off any road; `require_on_road` knows the road that there is."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,7 +61,7 @@ class StartRange:
         faster_mps: largest increase of speed, m/s; there is no decrease, since scenarios may begin from a stand.
 
     Raises:
-        EpisodeError: a number is below 0, or so large that a car would not stand on its lane.
+        EpisodeError: a number is none, below 0, or so large that a car would look off its road.
     """
 
     right_m: float = 0.3
@@ -66,8 +70,9 @@ class StartRange:
 
     def __post_init__(self) -> None:
         for name, most in MOST.items():
-            if not 0.0 <= (value := getattr(self, name)) <= most:
-                raise EpisodeError(f"{name} of the starts is {value}, expected 0 to {most:g}")
+            value: object = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= most:
+                raise EpisodeError(f"{name} of the starts is {value!r:.40}, expected a number from 0 to {most:g}")
             object.__setattr__(self, name, abs(value))  # -0.0 is a range, and no bound of one
 
     def draw(self, count: int, seed: int) -> tuple[StartOffset, ...]:
@@ -122,6 +127,32 @@ class StartPlan(StartRange):
         if (apart := len(set(drawn))) < len(drawn):
             raise EpisodeError(f"starts has {apart} that differ among the {len(drawn)} drawn, expected all to; {wider}")
 
+
+def require_on_road(starts: StartRange, scenario: Scenario, simulator: object) -> None:
+    """Refuse a range of starts that reaches off the road, before anything is driven; without a map none is refused.
+
+    Raises:
+        EpisodeError: at an end of the range a wheel is off the road, and at the scenario's own start none is.
+        SimulatorError, ScenarioError: as `Mapped.road_map` does.
+    """
+    if not isinstance(simulator, Mapped):
+        return
+    roads = simulator.road_map(scenario.map_name)
+
+    def off(start: StartOffset) -> bool:
+        return bool(np.isin(roads.surface_at(np.array(wheels(start.of(scenario).start))), _OFF_ROAD).any())
+
+    sides = product((-starts.right_m, starts.right_m), (-starts.turned_rad, starts.turned_rad))
+    ends = [StartOffset(right_m=aside, turned_rad=turned) for aside, turned in sides]
+    if not off(NOMINAL) and (found := next(filter(off, ends), None)):
+        side = "left" if found.right_m < 0 else "right"
+        raise EpisodeError(
+            f"starts of {scenario.name} reach {abs(found.right_m):g} m to the {side}, turned {found.turned_rad:+g} "
+            f"rad, where a wheel is off the road; make right_m or turned_rad smaller"
+        )
+
+
+_OFF_ROAD = (Surface.SIDEWALK, Surface.OTHER)
 
 USUAL_STARTS = StartRange()
 USUAL_PLAN = StartPlan()

@@ -28,7 +28,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes
-from roadproof.driving.starts import NOMINAL
+from roadproof.driving.starts import NOMINAL, require_on_road
 from roadproof.errors import CanvasNotReachedError, CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
@@ -181,6 +181,7 @@ class _Check:
             size = (world.input.height_px, world.input.width_px)
             require_usable(self.controller, size=size, device=self.device, gradients=self._attacks)
             scenario = begun_in(world, place.scenario)
+            require_on_road(self.plan.starts.range, scenario, world)
             stretch = self._stretch(place, world, scenario, self._known_paints(place, world, scenario))
             for key, (conditions, _) in self._told(place, stretch).items():
                 stored = self.before.get(key)

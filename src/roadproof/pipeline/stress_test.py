@@ -30,6 +30,7 @@ from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.starts import require_on_road
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import html_of, table
@@ -185,6 +186,8 @@ def stress_test(
         on_progress=on_progress,
     )
     check_paint(simulator, scenario, stages.space, budget.method)
+    if budget.starts:
+        require_on_road(budget.start_range, scenario, simulator)
     if cheapest_m is not None:
         check_wanted(cheapest_m)
         if not isinstance(budget.objective, PathDeviation):

@@ -19,6 +19,7 @@ from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.starts import require_on_road
 from roadproof.errors import StudyError
 from roadproof.io.arrays import packed
 from roadproof.paint import Site, conspicuousness
@@ -70,6 +71,7 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     _check_files(job, key)
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
+        require_on_road(job.starts.range, job.scenario, world)
         drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
         bare = bare_drives(job, world, controller, scratch.parent)
         for name, *_ in _conditions(job):
