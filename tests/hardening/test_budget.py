@@ -7,7 +7,7 @@ import pytest
 from roadproof.attacks import SteeringShift
 from roadproof.coverage import Shape
 from roadproof.errors import TrainingError
-from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, check_streets
+from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, by_street, check_streets
 from roadproof.pipeline.budget import QUICK
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
@@ -22,6 +22,16 @@ def test_streets_that_share_no_canvas_and_no_approach_are_accepted():
     # The same place of another map is another street.
     elsewhere = [dataclasses.replace(each, map_name="second") for each in named("left-07")]
     check_streets(named("left-07"), elsewhere)
+
+
+def test_scenarios_that_lie_near_each_other_are_one_street():
+    judged = named("left-02", "left-04", "right-04", "straight-09", "straight-12")
+    # straight-09 is near right-04 alone, which is near left-04.
+    assert by_street(judged) == (("left-02",), ("left-04", "right-04", "straight-09"), ("straight-12",))
+    assert by_street([judged[1], dataclasses.replace(judged[1], map_name="second", name="other")]) == (
+        ("left-04",),
+        ("other",),
+    )
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,17 @@ def test_hardening_that_spoils_clean_driving_did_not_help():
     assert told.sentence.endswith("fewer drives over the bare road are clean.")
 
 
+def test_scenarios_of_one_street_count_once():
+    rows = tuple(each for row in HELPED for each in judged(*row))
+    clean = (BareDrives(4, 4, ()),) * 2
+    told = Judgement(rows, clean, streets=(("a", "c"), ("b",))).verdict().compared
+    assert told.change_m.count == 2
+    assert told.change_m.value == pytest.approx(-((1.7 + 1.0) / 2 + 1.3) / 2)
+    assert told.before_m == verdict(*HELPED).compared.before_m
+    alone = Judgement(rows, clean, streets=(("a", "b", "c"),)).verdict()
+    assert (alone.outcome, alone.compared.change_m.low) == ("not shown", None)
+
+
 def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
     assert verdict(("a", "k", [1.0], [0.1]), ("b", "k", [1.0], [1.2])).outcome == "not shown"
     assert verdict(("a", "k", [1.0], [1.9]), ("b", "k", [1.0], [2.0])).outcome == "did not help"

@@ -120,9 +120,26 @@ def check_streets(training: Sequence[Scenario], judging: Sequence[Scenario]) -> 
             raise TrainingError(f"scenarios {', '.join(names)} name one twice; give each once")
     for one in training:
         for other in judging:
-            apart_m = math.dist((one.canvas.x_m, one.canvas.y_m), (other.canvas.x_m, other.canvas.y_m))
-            if one.map_name == other.map_name and apart_m < APART_M:
+            if (apart_m := _apart_m(one, other)) < APART_M:
                 raise TrainingError(
                     f"{one.name} is trained on and {other.name} judged on, but their canvases lie {apart_m:.0f} m "
                     f"apart, on one street; expected at least {APART_M:.0f} m: choose another street for judging"
                 )
+
+
+def by_street(scenarios: Sequence[Scenario]) -> tuple[tuple[str, ...], ...]:
+    """The names of the scenarios, those together that lie on one street: each less than `APART_M` from another."""
+    found: list[list[Scenario]] = []
+    for each in scenarios:
+        near = [street for street in found if any(_apart_m(each, other) < APART_M for other in street)]
+        found = [street for street in found if street not in near] + [
+            [*(other for street in near for other in street), each]
+        ]
+    return tuple(tuple(each.name for each in street) for street in found)
+
+
+def _apart_m(one: Scenario, other: Scenario) -> float:
+    """How far apart two canvases are, metres; on two maps they are nowhere near."""
+    if one.map_name != other.map_name:
+        return math.inf
+    return math.dist((one.canvas.x_m, one.canvas.y_m), (other.canvas.x_m, other.canvas.y_m))

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.loading import load_trainable
 from roadproof.errors import TrainingError
-from roadproof.hardening.budget import HardeningBudget, check_streets
+from roadproof.hardening.budget import HardeningBudget, by_street, check_streets
 from roadproof.hardening.judgement import Judgement
 from roadproof.hardening.plan import WEIGHTS, HardeningPlan
 from roadproof.hardening.result import Hardened, best_of
@@ -130,7 +130,7 @@ def harden(
         if judge_on:
             clean = stages.drive_clean(best, clean_on or streets)
             judged, unjudged = stages.judge(best, judge_on)
-            judgement = Judgement(judged, clean, unjudged)
+            judgement = Judgement(judged, clean, unjudged, by_street(judge_on))
         found = Hardened(
             controller=controller,
             hardened=plan.spec_with(weights),

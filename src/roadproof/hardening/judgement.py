@@ -174,11 +174,14 @@ class Judgement:
         clean: drives over the bare road, before and after.
         unjudged: why the hardened controller could not be attacked or compared on a street, by the street's name, such
             as that it no longer drives there.
+        streets: names of the scenarios, those together that lie on one street, which counts once; empty where each has
+            a street of its own.
     """
 
     judged: tuple[JudgedAttack, ...]
     clean: tuple[BareDrives, BareDrives]
     unjudged: dict[str, str] = field(default_factory=dict[str, str])
+    streets: tuple[tuple[str, ...], ...] = ()
 
     def verdict(self) -> HardeningVerdict:
         """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
@@ -206,7 +209,9 @@ class Judgement:
             for name in scenarios
         ]
         if len(scenarios) > 1:
-            changes, over = [float(np.mean(two) - np.mean(one)) for one, two in pairs], "streets"
+            change = {name: np.mean(two) - np.mean(one) for name, (one, two) in zip(scenarios, pairs, strict=True)}
+            apart = [[change[name] for name in street if name in change] for street in self._streets(scenarios)]
+            changes, over = [float(np.mean(each)) for each in apart if each], "streets"
         else:
             changes, over = [two - one for one, two in zip(*pairs[0], strict=True)], "starts"
         return BeforeAfter(
@@ -217,6 +222,9 @@ class Judgement:
             left_lane_before=self._left_lane(scenarios, after=False),
             left_lane_after=self._left_lane(scenarios, after=True),
         )
+
+    def _streets(self, scenarios: Sequence[str]) -> Sequence[Sequence[str]]:
+        return self.streets or [[name] for name in scenarios]
 
     def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
         return max(self._tried(scenario, after=after), key=lambda each: each.mean_m)
