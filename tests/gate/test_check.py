@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import nn
 
 import needs
 import roadproof
@@ -365,6 +366,21 @@ def test_an_architecture_is_known_by_its_shapes_not_its_weights():
     one, other = load_controller("pilotnet"), load_controller("pilotnet-b")
     assert architecture_of(one) == architecture_of(other) != architecture_of(load_controller("cil-small"))
     assert architecture_of(load_controller("cil-small")) != architecture_of(load_controller("cil"))
+
+
+def test_an_architecture_is_known_by_its_layers_also_within_a_class_that_is_no_module():
+    class Mine(MagentaShy):
+        def __init__(self, network):
+            super().__init__()
+            self.network = network
+
+    def net(activation):
+        return nn.Sequential(nn.Flatten(), nn.Linear(12, 4), activation, nn.Linear(4, 1))
+
+    one, again, other = (architecture_of(Mine(net(layer))) for layer in (nn.ReLU(), nn.ReLU(), nn.Tanh()))
+    assert one == again != other
+    assert architecture_of(Mine(load_controller("pilotnet"))) != architecture_of(Mine(load_controller("waypoint")))
+    assert architecture_of(Mine(None)).endswith("Mine")
 
 
 def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypatch):

@@ -38,6 +38,7 @@ from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest
+from roadproof.io.known import without_addresses
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
@@ -155,12 +156,19 @@ def _keep_apart(folder: Path, plan: CheckPlan) -> None:
 
 
 def architecture_of(controller: Controller) -> str:
-    """What a controller is made of, whatever it has learnt: its type, and of a module a hash of its tensors' shapes."""
+    """What a controller is made of, whatever it has learnt: its type, and a hash of its modules and tensors' shapes.
+
+    Of one that is no module, those that it keeps as attributes count.
+    """
     name = type(controller).__qualname__
-    if not isinstance(controller, nn.Module):
+    fields = getattr(controller, "__dict__", {})
+    kept = {"": controller} if isinstance(controller, nn.Module) else fields
+    modules = {key: value for key, value in kept.items() if isinstance(value, nn.Module)}
+    if not modules:
         return name
-    shapes = {key: list(value.shape) for key, value in controller.state_dict().items()}
-    return f"{name}-{digest(json.dumps(shapes))[:8]}"
+    layers = [(key, type(each).__qualname__, each.extra_repr()) for key in modules for each in modules[key].modules()]
+    shapes = [(key, path, list(getattr(value, "shape", ()))) for key in modules for path, value in modules[key].state_dict().items()]
+    return f"{name}-{digest(without_addresses(json.dumps([layers, shapes])))[:8]}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
