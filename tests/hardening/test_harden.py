@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from functools import partial
 
 import numpy as np
@@ -188,6 +189,17 @@ def test_two_processes_drive_through_the_town_and_over_the_bare_road_as_one_does
     assert {each[3] for each in told if each[0] == "Bare road, before"} >= {"streets", "streets, far is done"}
 
 
+def failing():
+    """A training step that gives no number after the first batches, as one that divides by zero."""
+    calls = []
+
+    def step(model, batch):
+        calls.append(batch)
+        return training_step(model, batch) * (math.nan if len(calls) > 2 else 1.0)
+
+    return step
+
+
 @pytest.mark.slow
 def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(town, tmp_path):
     out, whole = tmp_path / "a" / "out", tmp_path / "b" / "out"
@@ -201,6 +213,11 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
 
         with pytest.raises(StoppedError):
             run(town, out, on_progress=stop)
+        if stage.endswith("calibrating"):
+            with pytest.raises(
+                TrainingError, match=r"the loss is nan at step \d; mend the step, and the same call goes"
+            ):
+                run(town, out, training_step=failing())
     found = run(town, out)
     # The judged controller is none but the saved one.
     learnt, before = load_controller(found.hardened), load_controller("pilotnet")
@@ -218,6 +235,8 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     assert not any("searching" in each or "learning" in each for each in told)
     with pytest.raises(RoadproofError, match="holds a hardening with seed 0, now it is 1"):
         run(town, out, seed=1)
+    with pytest.raises(RoadproofError, match="holds a hardening with training step"):
+        run(town, out, training_step=failing())
     with pytest.raises(RoadproofError, match="holds a hardening with budget"):
         run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, repeats=2, batch=8)))
 

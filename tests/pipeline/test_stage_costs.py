@@ -60,6 +60,14 @@ def test_another_run_and_a_damaged_ledger_are_refused(tmp_path):
     assert read_cost(tmp_path / "elsewhere") == {}
 
 
+def test_parts_that_nothing_was_made_with_yet_may_change(tmp_path):
+    Ledger(tmp_path, ONE, STAGES)
+    Ledger(tmp_path, ONE | {"seed": 2}, STAGES, unused=["seed"])
+    Ledger(tmp_path, ONE | {"seed": 2}, STAGES)
+    with pytest.raises(RoadproofError, match="holds a run with seed 2, now it is 1"):
+        Ledger(tmp_path, ONE, STAGES)
+
+
 @pytest.mark.parametrize(
     "said",
     [{"identity": json.dumps([{"name": "left-03"}, "Budget(select=1)", {"figures": 5}, 0, "pilotnet"])}, {}],

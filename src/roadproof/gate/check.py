@@ -167,7 +167,11 @@ def architecture_of(controller: Controller) -> str:
     if not modules:
         return name
     layers = [(key, type(each).__qualname__, each.extra_repr()) for key in modules for each in modules[key].modules()]
-    shapes = [(key, path, list(getattr(value, "shape", ()))) for key in modules for path, value in modules[key].state_dict().items()]
+    shapes = [
+        (key, path, list(getattr(value, "shape", ())))
+        for key in modules
+        for path, value in modules[key].state_dict().items()
+    ]
     return f"{name}-{digest(without_addresses(json.dumps([layers, shapes])))[:8]}"
 
 

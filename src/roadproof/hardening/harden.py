@@ -27,7 +27,7 @@ from roadproof.controllers.loading import load_trainable
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, by_street, check_streets
 from roadproof.hardening.judgement import Judgement
-from roadproof.hardening.plan import WEIGHTS, HardeningPlan
+from roadproof.hardening.plan import STEP_PARTS, WEIGHTS, HardeningPlan
 from roadproof.hardening.result import Hardened, best_of
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import TrainingStep, require_loss
@@ -120,7 +120,9 @@ def harden(
     require_usable(teacher, size=size, device=device, gradients=budget.attack.method.by_gradient)
     require_loss(training_step, network, teacher, size=size, device=device)
     with working_in(folder):
-        ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening")
+        # Attacks of round 0 and drives through the town do not depend on the step: one that failed may be mended.
+        unused = () if plan.weights(1).exists() else STEP_PARTS
+        ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening", unused)
         stages = HardeningStages(plan, simulator, teacher, training_step, factory, processes, ledger, on_progress)
         done = stages.rounds(rounds)
         best = best_of(done)

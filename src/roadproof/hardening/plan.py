@@ -19,6 +19,7 @@ from roadproof.search_space import SearchSpace, derived_seed
 from roadproof.simulators.protocol import Simulator, world_of
 
 WEIGHTS = "hardened.safetensors"
+STEP_PARTS = ("training step", "training step's source")
 _FRESH = 1000
 """The least seed of judging; those of the rounds are below it."""
 
@@ -107,8 +108,8 @@ class HardeningPlan:
             "learnt": [repr(each) for each in self.budget.learnt(self.space)],
             "variation": repr(variation_of(attack.objective)),
             "seed": self.seed,
-            "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
-            "training step's source": known_by(step),
+            STEP_PARTS[0]: f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+            STEP_PARTS[1]: known_by(step),
         }
 
     def attack(

@@ -6,7 +6,7 @@ RUN/run.json   whose run it is, and the cost of every stage since it began
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,13 +52,21 @@ class Ledger:
         made_of: identity of the run, by name (`io.identity`).
         stages: names of all stages of the run, in order.
         what: the run in a word, for a message that refuses its folder.
+        unused: names of the parts that nothing in the folder was made with yet, which may be others now.
 
     Raises:
         RoadproofError: the folder belongs to another run; the message names what differs.
         OutputError: run.json cannot be written.
     """
 
-    def __init__(self, folder: Path, made_of: Mapping[str, object], stages: Sequence[str], what: str = "a run") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        made_of: Mapping[str, object],
+        stages: Sequence[str],
+        what: str = "a run",
+        unused: Collection[str] = (),
+    ) -> None:
         self._path, self._made_of = folder / FILE, cast("dict[str, Any]", plain(made_of))
         self._current, self._since = "", 0.0
         self.cost = {stage: StageCost() for stage in stages}
@@ -67,8 +75,11 @@ class Ledger:
             return
         before = _FILE.read(self._path)
         # Runs in the town as software draws it are older than this word.
-        require_same(folder, what, {"world": ""} | before.made_of, self._made_of, RoadproofError)
+        known = {"world": ""} | before.made_of | {name: self._made_of[name] for name in unused}
+        require_same(folder, what, known, self._made_of, RoadproofError)
         self.cost |= before.cost
+        if known != before.made_of:
+            self._write()
 
     @contextmanager
     def stage(self, name: str) -> Generator[None]:
