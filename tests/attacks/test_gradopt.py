@@ -401,8 +401,12 @@ def test_the_local_linearisation_is_what_two_renderings_say(masks):
 
 def test_the_published_search_refuses_what_was_not_published():
     recordings, controller = recording_set(frames=2), pull_to_the_right()
-    with pytest.raises(PatternError, match="published families alone"):
-        attack(recordings, controller, SearchSpace(figures=1, family="free"), method=Published())
+    for other in ({"family": "free"}, {"family": "published-bo"}, {"albedo": (0.2, 0.8)}, {"max_painted_share": 0.1}):
+        with pytest.raises(PatternError, match="families published and published-canvas-centre alone, without limits"):
+            attack(recordings, controller, SearchSpace(figures=1, **other), method=Published())
+    varied = SteeringShift(variation=Variation())
+    with pytest.raises(RoadproofError, match="the published search knows no variation"):
+        attack(recordings, controller, SearchSpace(figures=1), method=Published(), objective=varied)
     with pytest.raises(RoadproofError, match="enlarges the steering shift, not the path deviation"):
         attack(recordings, controller, SearchSpace(figures=1), method=Published(), objective=PathDeviation())
     with pytest.raises(RoadproofError, match="masks is 'soft', expected binary or antialiased"):

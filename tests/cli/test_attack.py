@@ -184,6 +184,27 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, invoke, nam
     assert not (tmp_path / "out" / "result.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--objective", "deviation"], "the published search enlarges the steering shift, not the path deviation"),
+        (["--robust"], "the published search knows no variation"),
+        (["--dtype", "bfloat16"], "the published search computes in float32, not bfloat16"),
+        (["--albedo", "0.2", "0.8"], "without limits on paint or albedo"),
+        (["--cheapest", "0.5"], "the published search looks for no least paint"),
+    ],
+    ids=str,
+)
+def test_a_published_search_with_what_was_not_published_is_refused_in_a_dry_run_too(
+    here, tmp_path, invoke, options, message
+):
+    words = ["attack", "set", "--controller", "own_controller:Linear", "--method", "published"]
+    code, printed = invoke(*words, "--out", str(tmp_path / "out"), *options, "--dry-run")
+    assert (code, printed.out) == (2, "")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+
+
 def test_cuda_that_is_absent_is_named(here, tmp_path, invoke, monkeypatch):
     monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     code, printed = invoke(*command("--out", str(tmp_path), "--device", "cuda"))

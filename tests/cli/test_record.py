@@ -158,6 +158,14 @@ MISTAKES = {
     "unknown weather": (["record", "left-03", "--weather", "dry"], "--weather is 'dry'"),
     "unknown scheme": (["record", "left-03", "--scheme", "grup"], "did you mean group?"),
     "two ways": (["record", "left-03", "--noise-deg", "1", "2", "--swerve-m", "1"], "choose one way"),
+    "published swerves": (
+        ["record", "left-03", "--budget", "published", "--swerve-m", "1"],
+        "--swerve-m is given",
+    ),
+    "published, few frames": (
+        ["record", "left-03", "--budget", "published", "--frames", "8"],
+        "--frames is given",
+    ),
     "even T": (["record", "left-03", "--trajectories", "2"], "T is 2 trajectories"),
     "no run": (["calibrate", "."], "holds no run with a folder named record"),
     "unknown method": (["calibrate", "runs", "--method", "two-paints"], "did you mean two-paint?"),

@@ -169,8 +169,7 @@ class Published(Method):
             RoadproofError: the objective is not a steering shift without variation, or the recordings have pixel maps,
                 which binary masks know nothing of.
         """
-        if not isinstance(objective, SteeringShift) or objective.variation is not None:
-            raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
+        self.check_objective(objective)
         if self.masks == "binary" and any(drive.maps is not None for drive in recordings.recordings):
             raise RoadproofError(
                 "the published search knows light by a colour transform alone, and these recordings have it in pixel "
@@ -179,16 +178,28 @@ class Published(Method):
         return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
 
     def check_space(self, space: SearchSpace) -> None:
-        """Check that the patterns are those of the publication: rectangles of a published family, without limits.
+        """Check that the patterns are those of the publication: its rectangles, in any colour, without limits.
 
         Raises:
-            PatternError: the space has limits on paint, or a family that was not published.
+            PatternError: the space has limits on paint or colour, or a family that the search had not.
         """
-        if not space.family.startswith("published") or space.max_painted_share is not None or space.limits is not None:
+        limited = space.max_painted_share is not None or space.limits is not None or space.albedo != (0.0, 1.0)
+        if space.family not in ("published", "published-canvas-centre") or limited:
             raise PatternError(
-                "the published search knows the published families alone, without limits on paint; change them, or "
-                "search with method gradopt"
+                "the published search knows the families published and published-canvas-centre alone, without limits "
+                "on paint or albedo; change them, or search with method gradopt"
             )
+
+    def check_objective(self, objective: Objective) -> None:
+        """Check that what is made large is what the publication made large.
+
+        Raises:
+            RoadproofError: the objective is not a steering shift, or one in expectation.
+        """
+        if not isinstance(objective, SteeringShift):
+            raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
+        if objective.variation is not None:
+            raise RoadproofError("the published search knows no variation; leave it out, or search with method gradopt")
 
     def search(self, measure: Measure, space: SearchSpace, **running: Unpack[Running]) -> Search:
         """Search by gradient as published."""

@@ -17,7 +17,7 @@ from roadproof.cli.verbs import begin, keep_command
 from roadproof.limits import MANY
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult, Objective
+    from roadproof.attacks import AttackResult, Objective, Published
     from roadproof.attacks.groups import Group
     from roadproof.controllers import Controller
     from roadproof.recordings import RecordingSet
@@ -84,6 +84,7 @@ def attack(
     """Find the painted pattern that moves a controller most on recorded drives."""
     from roadproof.attacks import (
         OBJECTIVES,
+        Published,
         kept_attack,
         method_of,
         parse_groups,
@@ -117,6 +118,8 @@ def attack(
     drives = load_recordings(recordings)
     chosen_goal = None if objective is None else OBJECTIVES[options.choice(objective, "objective", tuple(OBJECTIVES))]
     goal = varied(chosen_goal or usual_objective(drives, searched), paint.variation)
+    if isinstance(searched, Published):
+        _check_published(searched, goal, dtype, cheapest)
     space = space.on(site_of(drives))
     if cheapest is not None:
         _check_cheapest(drives, goal)
@@ -155,6 +158,19 @@ def attack(
     if limit_costs:
         found["limits"] = _limit_costs(drives, attacked, result, chosen, goal, device, out)
     answer(found)
+
+
+def _check_published(method: Published, objective: Objective, dtype: str, cheapest: float | None) -> None:
+    """Refuse a published search with what was not published."""
+    from roadproof.errors import RoadproofError
+
+    method.check_objective(objective)
+    if dtype != "float32":
+        raise RoadproofError(f"the published search computes in float32, not {dtype}; leave --dtype out")
+    if cheapest is not None:
+        raise RoadproofError(
+            "the published search looks for no least paint; leave --cheapest out, or --method published"
+        )
 
 
 def _check_attacked(

@@ -50,7 +50,7 @@ def demo(
     from roadproof.controllers import load_controller
     from roadproof.pipeline.budget import BUDGETS
     from roadproof.pipeline.limit_costs import relaxed_limits
-    from roadproof.pipeline.stress_test import stress_test
+    from roadproof.pipeline.stress_test import check_asked, stress_test
     from roadproof.pipeline.workload import of_cheapest, of_drives, of_finding, of_run
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -61,6 +61,7 @@ def demo(
     spent = replace(spent, rounds=rounds, attack_weathers=options.weathers_of(attack_weathers, "attack-weathers"))
     spent = replace(spent, objective=varied(spent.objective, paint.variation))
     space = SearchSpace(figures=figures, limits=paint.limits)
+    check_asked(spent, space, cheapest_m=cheapest, limit_costs=limit_costs)
     who = load_controller(controller, device=device)
     work = of_run(spent, who, processes=processes)
     if cheapest is not None:

@@ -14,6 +14,9 @@ from roadproof.driving.starts import USUAL_STARTS, StartRange
 from roadproof.errors import RoadproofError
 from roadproof.io.tables import each_once
 
+PUBLISHED_WINDOW = Window(least_px=600, frames=100)
+"""All frames in which the canvas is as large as in the released ones."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Budget:
@@ -88,6 +91,7 @@ class Budget:
         told: dict[str, tuple[object, object]] = {
             "objective": (self.objective.name, SteeringShift().name),
             "perturbation": (type(self.trajectories.perturbation).__name__, SteeringNoise.__name__),
+            "window": (self.window, PUBLISHED_WINDOW),
             "calibration": (str(self.calibration), str(CalibrationMethod.PUBLISHED)),
             "select": (self.select, 0),
             "rounds": (self.rounds, 0),
@@ -129,7 +133,7 @@ PUBLISHED = Budget(
     method=Published(),
     objective=SteeringShift(),
     trajectories=Trajectories(perturbation=SteeringNoise()),
-    window=Window(least_px=600, frames=100),
+    window=PUBLISHED_WINDOW,
     calibration=CalibrationMethod.PUBLISHED,
     select=0,
 )

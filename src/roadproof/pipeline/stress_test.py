@@ -185,15 +185,10 @@ def stress_test(
         pool=here_or_beside(simulator, factory, processes),
         on_progress=on_progress,
     )
+    check_asked(budget, stages.space, cheapest_m=cheapest_m, limit_costs=limit_costs)
     check_paint(simulator, scenario, stages.space, budget.method)
     if budget.starts:
         require_on_road(budget.start_range, scenario, simulator)
-    if cheapest_m is not None:
-        check_wanted(cheapest_m)
-        if not isinstance(budget.objective, PathDeviation):
-            raise RoadproofError("the cheapest pattern is looked for in the recorded world; search a path deviation")
-    if limit_costs:
-        relaxed_limits(stages.space, budget.objective)
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
@@ -203,6 +198,22 @@ def stress_test(
         require_pedals(controller)
     with working_in(folder), stages.pool:
         return _all_of(stages, film=film, cheapest_m=cheapest_m, limit_costs=limit_costs)
+
+
+def check_asked(budget: Budget, space: SearchSpace, *, cheapest_m: float | None, limit_costs: bool) -> None:
+    """Check that a budget's search can give what is asked for, which needs no simulator.
+
+    Raises:
+        PatternError: the method cannot search the patterns, or costs of limits are asked for and there are none.
+        RoadproofError: the least paint, or costs of limits, are asked for without a path deviation.
+    """
+    budget.method.check_space(space)
+    if cheapest_m is not None:
+        check_wanted(cheapest_m)
+        if not isinstance(budget.objective, PathDeviation):
+            raise RoadproofError("the cheapest pattern is looked for in the recorded world; search a path deviation")
+    if limit_costs:
+        relaxed_limits(space, budget.objective)
 
 
 def _reset(scenario: Scenario, simulator: Simulator, _: None) -> None:
