@@ -7,7 +7,7 @@ and their values: rename one, and finished jobs are unknown.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal, TypeAlias, cast
 
 import msgspec
@@ -129,7 +129,12 @@ def method_plan(values: Mapping[str, Any]) -> MethodPlan:
     if word not in METHODS:
         raise StudyError(f"search is {word!r:.60}, expected one of {', '.join(METHODS)}")
     kinds = {GradOpt.word: GradOptPlan, Published.word: PublishedPlan}
-    return build(kinds.get(word, BlackBoxPlan), values, f"method {values['name']}", StudyError)
+    kind = kinds.get(word, BlackBoxPlan)
+    others = {each.name for other in (GradOptPlan, PublishedPlan, BlackBoxPlan) for each in fields(other)}
+    for key in values:
+        if key in others - {each.name for each in fields(kind)}:
+            raise StudyError(f"method {name}: search {word} has no {key}; leave it out, or choose another search")
+    return build(kind, values, f"method {name}", StudyError)
 
 
 def budget_of(method: MethodPlan, weather: Weather) -> Budget:

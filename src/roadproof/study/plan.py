@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,7 @@ from roadproof.controllers.loading import files_of
 from roadproof.controllers.shipped import installed_weights, shipped_names
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import USUAL_PLAN, StartPlan
-from roadproof.errors import RoadproofError, StudyError
+from roadproof.errors import PatternError, RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
 from roadproof.io.tables import build, check_range, each_once
@@ -21,6 +21,9 @@ from roadproof.io.text import read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, check_seed
 from roadproof.paint import PaintLimits
 from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
+from roadproof.roads.maps import load_map
+from roadproof.roads.marks import site_at
+from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
 from roadproof.simulators.loading import check_spec
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
@@ -186,6 +189,16 @@ class Study(Conditions):
                 raise StudyError(f"method {method.name} is as published, without [paint] and [variation]; leave it out")
             if driven and self.variation:
                 raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
+        if self.paint is None:
+            return
+        own = self.simulator.startswith("town")  # the marks of other maps are known when their simulator is open
+        for scenario, figures in product(self.scenarios, self.figures):
+            try:
+                site = site_at(_OwnMaps() if own else None, scenario)
+                site = self.paint.site(site if own else replace(site, marks=()))
+                self.paint.check(site, albedo=(0.0, 1.0), black=figures == BLACK, measured=False)
+            except PatternError as error:
+                raise StudyError(f"[paint] on {scenario.name}: {error}") from None
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -218,6 +231,14 @@ def load_study(path: AnyPath, *, trust: bool = False) -> Study:
     except RoadproofError as error:
         raise StudyError(f"{path}: {error}") from None
     return study
+
+
+class _OwnMaps:
+    """The maps that the town drives on, without the town."""
+
+    def road_map(self, name: str) -> RoadMap:
+        """The map that a scenario names."""
+        return load_map(name)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
