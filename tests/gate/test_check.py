@@ -18,13 +18,15 @@ from roadproof.controllers import load_controller
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import CanvasNotReachedError, CheckError, RecordingError
+from roadproof.errors import CanvasNotReachedError, CheckError, PatternError, RecordingError
 from roadproof.gate.check import architecture_of, run_check
 from roadproof.gate.places import places_of
 from roadproof.gate.plan import load_check
 from roadproof.gate.result import CHECK_FILE
-from roadproof.gate.stretch import Stretch
+from roadproof.gate.stretch import Stretch, known_paints
 from roadproof.gate.verdict import Kind, Status
+from roadproof.paint import PaintLimits
+from roadproof.paint.site import LaneMark, Site
 from team_folder import PLAN, MagentaShy, magenta_shy
 
 CHANGE = '[change]\nreference = "reference"\ndeviation_m = { absolute = 0.1, relative = 0.2 }\n'
@@ -468,3 +470,10 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         assert (team / "kept/smoke/check.json").exists()
     with pytest.raises(CheckError, match="is kept for a reference of the plan"):
         run_check(load_check("loose.toml", trust=True), magenta_shy(), "kept/smoke")
+
+
+def test_limits_that_leave_no_paint_are_refused_where_nothing_is_drawn_at_random_too(team, tmp_path):
+    plan = replace(load_check(team / "check.toml", trust=True), random=0, paint=PaintLimits(keep_out_m=10.0))
+    line = LaneMark(points_m=((3.4, 0.0), (3.4, 9.5)), width_m=0.12, colour="#ffffff")
+    with pytest.raises(PatternError, match="a keep-out of 10 m around lane marks leaves no place"):
+        known_paints(plan, plan.scenarios[0], Site(size_m=(6.8, 9.5), marks=(line,)), tmp_path)

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from roadproof.attacks import SteeringShift
+from roadproof.attacks import RandomSearch, SteeringShift
 from roadproof.coverage import Shape
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, by_street, check_streets
@@ -61,6 +61,15 @@ def test_judging_paints_in_other_shapes_what_else_the_space_allows():
     asked = SearchSpace(figures=2, colour=False, albedo=(0.1, 0.8), max_painted_share=0.1)
     for _, space in HardeningBudget().kinds(asked).values():
         assert dataclasses.replace(space, family=asked.family, shape=asked.shape) == asked
+
+
+def test_kinds_of_attack_are_called_what_they_are():
+    space, usual = SearchSpace(figures=1), HardeningBudget()
+    assert usual.searched == "by gradient, as in training"
+    assert list(usual.kinds(space)) == ["tpe, 100 patterns tried", "ellipses by gradient"]
+    driven = dataclasses.replace(usual, judge=dataclasses.replace(usual.judge, method=RandomSearch(calls=4)))
+    assert driven.searched == "by random"
+    assert list(driven.kinds(space))[1] == "ellipses by random"
 
 
 def test_budgets_that_make_no_sense_are_refused():

@@ -89,8 +89,17 @@ class HardeningBudget:
         shapes = replace(space, family="free", shape=self.unseen_shape)
         return {
             f"{self.unseen.word}, {self.unseen.steps(self.judge.objective)} patterns tried": (self.unseen, space),
-            f"{self.unseen_shape}s by gradient": (self.judge.method, shapes),
+            f"{self.unseen_shape}s {self._how}": (self.judge.method, shapes),
         }
+
+    @property
+    def searched(self) -> str:
+        """The kind of attack of `judge`, in words."""
+        return f"{self._how}, as in training" if self.judge.method.word == self.attack.method.word else self._how
+
+    @property
+    def _how(self) -> str:
+        return "by gradient" if self.judge.method.by_gradient else f"by {self.judge.method.word}"
 
 
 HARDENING_BUDGETS = {

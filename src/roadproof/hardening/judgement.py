@@ -33,7 +33,6 @@ from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
-SEARCHED = "by gradient, as in training"
 OLD = "found against the controller before"
 
 
@@ -265,7 +264,7 @@ class StreetJudge:
         plan, folder = self.plan, self.plan.judged(self.number, self.scenario)
         tested = plan.attack(self.simulator, self.number, self.scenario, self.on_progress, judging=True)
         calls = sum(cost.simulator_calls for cost in tested.cost.values())
-        judged = [self._judged(tested.evaluation, SEARCHED, calls)]
+        judged = [self._judged(tested.evaluation, plan.budget.searched, calls)]
         controller, recordings = plan.controller(self.number), load_recordings(folder / "recordings")
         for number, (kind, (method, space)) in enumerate(plan.budget.kinds(plan.space).items(), 1):
             place = folder / f"kind-{number}"
