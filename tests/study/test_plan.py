@@ -272,6 +272,7 @@ ASIDE = "[starts]\nturned_rad = 0.0\nfaster_mps = 0.0\nright_m = "
         ("[traffic]", "[traffic", "not valid TOML"),
         ('controller = "cil"\n', "", "lacks controller"),
         ("seeds = [0, 1]", 'scenario_file = "../own.toml"', "leaves the study's folder"),
+        ("[traffic]", "[starts]\nright_m = 1.0\nturned_rad = 0.3\n\n[traffic]", "starts of left-01 reach 1 m to the"),
         ("[traffic]", "[paint]\nkeep_out_m = 10.0\n\n[traffic]", r"\[paint\] on left-01: a keep-out of 10 m"),
         ("[traffic]", '[paint]\ncolours = ["#ff8000"]\n\n[traffic]', "the limits on colour leave no black"),
         ("[traffic]", f"{ASIDE}0.0\n\n[traffic]", "starts has the scenario's own among those drawn"),

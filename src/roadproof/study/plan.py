@@ -12,7 +12,7 @@ from roadproof.compositing import Variation
 from roadproof.controllers.loading import files_of
 from roadproof.controllers.shipped import installed_weights, shipped_names
 from roadproof.datatypes import Weather
-from roadproof.driving.starts import USUAL_PLAN, StartPlan
+from roadproof.driving.starts import USUAL_PLAN, StartPlan, require_on_road
 from roadproof.errors import PatternError, RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
@@ -179,6 +179,9 @@ class Study(Conditions):
             check_seed(seed, "seeds", StudyError)
             self.starts.check_drawn([seed])
         check_spec(self.simulator)
+        if self._in_town:
+            for scenario in self.scenarios:
+                require_on_road(self.starts.range, scenario, _OwnMaps())
         self._check_paint()
 
     def _check_paint(self) -> None:
@@ -191,7 +194,7 @@ class Study(Conditions):
                 raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
         if self.paint is None:
             return
-        own = self.simulator.startswith("town")  # the marks of other maps are known when their simulator is open
+        own = self._in_town  # the marks of other maps are known when their simulator is open
         for scenario, figures in product(self.scenarios, self.figures):
             try:
                 site = site_at(_OwnMaps() if own else None, scenario)
@@ -199,6 +202,11 @@ class Study(Conditions):
                 self.paint.check(site, albedo=(0.0, 1.0), black=figures == BLACK, measured=False)
             except PatternError as error:
                 raise StudyError(f"[paint] on {scenario.name}: {error}") from None
+
+    @property
+    def _in_town(self) -> bool:
+        """Whether the maps are known before any simulator is open."""
+        return self.simulator.split(":")[0] == "town"
 
     @property
     def jobs(self) -> tuple[Job, ...]:
