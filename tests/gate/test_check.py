@@ -157,8 +157,11 @@ def test_who_does_not_drive_well_without_paint_does_not_pass(team, tmp_path, con
     found = by_name(result)
     assert found["bare road"].status is Status.FAILED
     assert {found[name].status for name in ("green", "magenta")} == {Status.TOO_FEW}
-    assert not (tmp_path / "worst.jpg").exists()
-    assert "worst.jpg" not in (tmp_path / "summary.md").read_text()
+    summary = (tmp_path / "summary.md").read_text()
+    assert "![Not clean, test-road, clear-noon, bare road: one of these drives, from its start to its end]" in summary
+    with Image.open(tmp_path / "worst.jpg") as picture:
+        assert picture.width == 1500
+        assert np.asarray(picture).std() > 10
 
 
 def full_plan(team):

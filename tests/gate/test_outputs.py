@@ -73,8 +73,7 @@ def test_names_are_shown_as_they_are_whatever_is_in_them(tmp_path, controller, n
 def test_the_worst_drive_is_shown_without_what_was_not_recorded_however_dark_it_was(tmp_path, level, rows):
     pictures = np.zeros((6, 60, 80, 3), np.uint8)
     pictures[:, 20:] = level
-    Strip(time_s=np.arange(6.0), lateral_m=np.zeros(6), clean=pictures, painted=pictures).save(tmp_path / "strip.npz")
-    write_worst(tmp_path / "strip.npz", tmp_path / "worst.jpg")
+    write_worst([pictures, pictures], tmp_path / "worst.jpg")
     with Image.open(tmp_path / "worst.jpg") as shown:
         assert shown.size == (SHOWN_PX, round(SHOWN_PX * rows / (80 * WORST_COLUMNS)))
 

@@ -30,7 +30,7 @@ from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL, require_on_road
 from roadproof.errors import CanvasNotReachedError, CheckError
-from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
+from roadproof.gate.outputs import WORST, WORST_COLUMNS, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
 from roadproof.gate.plan import CheckPlan, Key, fresh
 from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
@@ -42,7 +42,7 @@ from roadproof.io.known import without_addresses
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import STRIP, film_drives, forget_film
+from roadproof.pipeline.film import STRIP, Strip, film_drives, forget_film, pictures_of
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
@@ -325,18 +325,25 @@ class _Check:
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows.
 
-        It is the one with the drive furthest astray of the painted cases that do not pass, or else of all that do.
+        It is the one with the drive furthest astray of the painted cases that do not pass, or else one of the bare road
+        that does not, or else of all painted ones.
         """
         painted = [(case, worst) for case in cases if case.kind is not Kind.BARE and (worst := worst_of(case.drives))]
         wrong = [each for each in painted if each[0].status is not Status.PASSED]
-        if not painted:
+        spoilt = [(case, drive) for case in cases if case.kind is Kind.BARE for drive in case.drives if drive.wrong]
+        spoilt = [each for each in spoilt if each[0].status is not Status.PASSED]
+        if not painted and not spoilt:
             return None
-        case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m)
+        case, worst = spoilt[0] if spoilt and not wrong else max(wrong or painted, key=lambda each: each[1].deviation_m)
         place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
         drives = self.folder / DRIVES / case.scenario
-        paint = read_paint(Path(worst.paint))
         with place.factory() as world:
             start = worst.start.of(begun_in(world, place.scenario))
-            film_drives(world, start, (worst.clean, worst.painted), paint, drives)
-        write_worst(drives / STRIP, self.folder / WORST)
+            if case.kind is Kind.BARE:
+                pictures = [pictures_of(world, start, worst.clean, drives, count=WORST_COLUMNS)]
+            else:
+                film_drives(world, start, (worst.clean, worst.painted), read_paint(Path(worst.paint)), drives)
+                strip = Strip.load(drives / STRIP)
+                pictures = [strip.clean, strip.painted]
+        write_worst(pictures, self.folder / WORST)
         return case

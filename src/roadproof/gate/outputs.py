@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.gate.result import Case, CheckResult
-from roadproof.gate.verdict import Status, digits_apart
+from roadproof.gate.verdict import Kind, Status, digits_apart
 from roadproof.io.files import printable, write_atomically, write_text
-from roadproof.pipeline.film import Strip
 from roadproof.recordings import evenly
 from roadproof.report.formatting import MISSING, in_words, markdown_text
 
@@ -120,7 +120,10 @@ def write_summary(result: CheckResult, pictured: Case | None, path: Path) -> Non
     if pictured is not None:
         # A case that passes may go further: deviations up to its limit are let pass.
         among = "Furthest astray" if pictured.status is Status.PASSED else "Furthest astray of what does not pass"
-        about = _shown(f"{among}, {pictured}: above without paint, below with it, at the same instants")
+        shows = "above without paint, below with it, at the same instants"
+        if pictured.kind is Kind.BARE:
+            among, shows = "Not clean", "one of these drives, from its start to its end"
+        about = _shown(f"{among}, {pictured}: {shows}")
         lines += ["", f"![{about}]({WORST})", "", f"*{about} (`{WORST}`).*"]
     write_text(path, "\n".join(lines) + "\n")
 
@@ -134,21 +137,18 @@ def _shown(text: str) -> str:
     return markdown_text(printable(text))
 
 
-def write_worst(strip: Path, path: Path) -> None:
-    """Write the picture of a passage: above without paint, below with it.
+def write_worst(drives: Sequence[UInt8[np.ndarray, "n h w 3"]], path: Path) -> None:
+    """Write a picture of drives, one below the other, each at some of its moments.
 
     Args:
-        strip: the file of pictures that `pipeline.film.film_drives` left.
+        drives: the camera's pictures of each drive, of one size; of all as many.
         path: the JPEG file to write.
 
     Raises:
-        EpisodeError: the file of pictures is missing or damaged.
         OutputError: the picture cannot be written.
     """
-    found = Strip.load(strip)
-    moments = evenly(len(found.painted), WORST_COLUMNS)
-    rows = [np.concatenate(list(pictures[moments]), 1) for pictures in (found.clean, found.painted)]
-    whole = np.concatenate(rows)
+    moments = evenly(len(drives[0]), WORST_COLUMNS)
+    whole = np.concatenate([np.concatenate(list(pictures[moments]), 1) for pictures in drives])
     # Around what was recorded, pictures of the recorded world are black.
     shown = whole.max((1, 2)) > BLACK
     picture = Image.fromarray(whole[shown] if shown.any() else whole)

@@ -25,6 +25,7 @@ from roadproof.io.files import write_atomically
 from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
 from roadproof.processes import Pool, open_or_here
+from roadproof.recordings import evenly
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -173,6 +174,23 @@ def film_drives(
         if (folder / FILM).stat().st_size <= MOST_BYTES:
             break
     return True
+
+
+def pictures_of(
+    simulator: Simulator, start: Scenario, file: str, folder: Path, *, count: int
+) -> UInt8[np.ndarray, "n h w 3"]:
+    """The camera's pictures of one judged drive over the bare road, from its start to its end, at most `count`.
+
+    Args are those of `film_drives`.
+    """
+    (episode,) = load_episodes(folder, [file])
+    steps = evenly(len(episode), count).tolist()
+    kept = look_again(simulator, episode, start, steps, _small, full_pictures=True)
+    return np.stack([kept[step] for step in steps])
+
+
+def _small(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
+    return np.asarray(Image.fromarray(seen.shown).resize(STRIP_SIZE, Image.Resampling.LANCZOS))
 
 
 def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, count: int) -> list[int]:
