@@ -29,7 +29,7 @@ class EpisodeError(RoadproofError, ValueError):
 
 
 class CanvasNotReachedError(RecordingError, EpisodeError):
-    """Without paint a car never comes to the canvas, or not unharmed, so that nothing can be recorded or compared."""
+    """Without paint a car does not come to the canvas unharmed, or hardly moves, so that nothing can be recorded."""
 
 
 class CalibrationError(RoadproofError, RuntimeError):

@@ -306,6 +306,9 @@ def test_starts_off_the_road_that_is_driven_are_refused_before_anything_is(town,
     assert not (tmp_path / "out").exists()
     for each in builtin_scenarios():
         require_on_road(StartRange(), each, town)
+    require_on_road(wide, scenario, object())  # nobody knows the road
+    aside = dataclasses.replace(scenario, start=StartOffset(right_m=3.0).of(scenario).start)
+    require_on_road(wide, aside, town)  # whoever begins beside the road meant it
 
 
 def test_a_range_of_minus_nothing_is_one_of_nothing():

@@ -384,6 +384,8 @@ def test_an_architecture_is_known_by_its_layers_also_within_a_class_that_is_no_m
 
     one, again, other = (architecture_of(Mine(net(layer))) for layer in (nn.ReLU(), nn.ReLU(), nn.Tanh()))
     assert one == again != other
+    held = [architecture_of(Mine([{"one": net(layer)}])) for layer in (nn.ReLU(), nn.Tanh())]
+    assert held[0] != held[1]
     assert architecture_of(Mine(load_controller("pilotnet"))) != architecture_of(Mine(load_controller("waypoint")))
     assert architecture_of(Mine(None)).endswith("Mine")
 
@@ -476,7 +478,9 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
 
 
 def test_limits_that_leave_no_paint_are_refused_where_nothing_is_drawn_at_random_too(team, tmp_path):
-    plan = replace(load_check(team / "check.toml", trust=True), random=0, paint=PaintLimits(keep_out_m=10.0))
+    smoke = replace(load_check(team / "check.toml", trust=True), random=0, paint=PaintLimits(keep_out_m=10.0))
     line = LaneMark(points_m=((3.4, 0.0), (3.4, 9.5)), width_m=0.12, colour="#ffffff")
+    given = (smoke.scenarios[0], Site(size_m=(6.8, 9.5), marks=(line,)), tmp_path)
     with pytest.raises(PatternError, match="a keep-out of 10 m around lane marks leaves no place"):
-        known_paints(plan, plan.scenarios[0], Site(size_m=(6.8, 9.5), marks=(line,)), tmp_path)
+        known_paints(replace(smoke, budget="full"), *given)
+    assert {each.kind for each in known_paints(smoke, *given)} == {Kind.STORED}, "there nothing is searched or drawn"

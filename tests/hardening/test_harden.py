@@ -17,10 +17,12 @@ from roadproof.controllers import ConditionalPilotNet, load_controller, save_con
 from roadproof.controllers.loading import load_trainable
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives import Trajectories, Window
-from roadproof.errors import RoadproofError, TrainingError
+from roadproof.driving.starts import StartRange
+from roadproof.errors import EpisodeError, RecordingError, RoadproofError, TrainingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import STAGES, harden
+from roadproof.hardening.judgement import StreetJudge
 from roadproof.hardening.page import write_hardening
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round, best_of
@@ -147,6 +149,22 @@ def test_one_that_no_longer_drives_a_street_for_judging_is_told_with_the_reason(
     assert stages_of(plan, town).judge(1, [near, far]) == (judged, unjudged)
 
 
+def test_a_file_that_is_damaged_is_no_verdict(town, tmp_path, monkeypatch):
+    def damaged(judge):
+        raise RecordingError("drive.npz is incomplete or damaged; record again")
+
+    monkeypatch.setattr(StreetJudge, "judge", damaged)
+    with pytest.raises(RecordingError, match="damaged"):
+        stages_of(planned(tmp_path, TINY), town).judge(1, [street(tmp_path, "near", 15.0)])
+
+
+def test_starts_off_the_road_of_a_street_for_judging_are_refused_before_anything_is_driven(town, tmp_path):
+    wide = dataclasses.replace(TINY.judge, start_range=StartRange(right_m=1.0, turned_rad=0.3))
+    with pytest.raises(EpisodeError, match="starts of far reach 1 m to the"):
+        run(town, tmp_path / "out", budget=dataclasses.replace(TINY, judge=wide))
+    assert not (tmp_path / "out").exists()
+
+
 def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
     asked = planned(tmp_path, dataclasses.replace(TINY, town_drives=1))
     spoilt = load_trainable("pilotnet")
@@ -214,9 +232,7 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
         with pytest.raises(StoppedError):
             run(town, out, on_progress=stop)
         if stage.endswith("calibrating"):
-            with pytest.raises(
-                TrainingError, match=r"the loss is nan at step \d; mend the step, and the same call goes"
-            ):
+            with pytest.raises(TrainingError, match=r"the loss is nan at step \d; mend the step"):
                 run(town, out, training_step=failing())
     found = run(town, out)
     # The judged controller is none but the saved one.

@@ -76,8 +76,10 @@ def test_scenarios_of_one_street_count_once():
     assert told.change_m.count == 2
     assert told.change_m.value == pytest.approx(-((1.7 + 1.0) / 2 + 1.3) / 2)
     assert told.before_m == verdict(*HELPED).compared.before_m
-    alone = Judgement(rows, clean, streets=(("a", "b", "c"),)).verdict()
-    assert (alone.outcome, alone.compared.change_m.low) == ("not shown", None)
+    # Of one street alone the interval is over the starts, from each of which all its scenarios are driven.
+    alone = Judgement(rows, clean, streets=(("a", "b", "c"),)).verdict().compared
+    assert (alone.over, alone.change_m.count) == ("starts", 2)
+    assert alone.change_m.value == pytest.approx(-(1.7 + 1.3 + 1.0) / 3)
 
 
 def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():

@@ -336,3 +336,14 @@ def test_a_plan_made_in_python_is_checked_by_the_objects_it_is_for(kind, values,
     name = {} if kind in (TrafficPlan, StartPlan) else {"name": "a"}
     with pytest.raises(RoadproofError, match=message):
         kind(**name, **values)
+
+
+def test_limits_in_a_simulator_of_which_the_map_is_not_known_are_checked_as_far_as_they_can_be(tmp_path):
+    far = TEXT.replace('controller = "cil"', 'controller = "cil"\nsimulator = "carla://localhost:2000"')
+    assert load_study(
+        written(tmp_path, far.replace("[traffic]", "[paint]\nkeep_out_m = 10.0\n\n[traffic]")), trust=True
+    )
+    with pytest.raises(StudyError, match="the limits on colour leave no black"):
+        load_study(
+            written(tmp_path, far.replace("[traffic]", '[paint]\ncolours = ["#ff8000"]\n\n[traffic]')), trust=True
+        )

@@ -60,12 +60,14 @@ def record(
     if noise_deg is not None and swerve_m:
         raise RecordingError("both --noise-deg and --swerve-m are given; choose one way to perturb drives")
     usual = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
-    told = {"trajectories": trajectories, "swerve-m": swerve_m, "noise-deg": noise_deg, "frames": frames}
-    changed = [name for name, value in told.items() if value not in (None, [])]
-    changed += ["scheme"] * (scheme != "group") + ["horizon-m"] * (horizon_m != usual.window.horizon_m)
-    if budget == "published" and changed:
+    changed = {
+        "swerve-m": bool(swerve_m),
+        "frames": frames not in (None, usual.window.frames),
+        "horizon-m": horizon_m != usual.window.horizon_m,
+    }
+    if budget == "published" and (other := next((name for name, given in changed.items() if given), None)):
         raise RecordingError(
-            f"--{changed[0]} is given with --budget published, which records as the paper did; leave one of them out"
+            f"--{other} is given with --budget published, which records as the paper did; leave one of them out"
         )
     perturbation = usual.trajectories.perturbation
     if swerve_m:

@@ -149,7 +149,9 @@ def _beside(
     # A car that stands has no direction.
     start, step, length = reference[:-1][length > 1e-6], step[length > 1e-6], length[length > 1e-6]
     if not len(step):
-        raise EpisodeError("the reference drive does not move, so nothing can be beside it; check the controller")
+        raise CanvasNotReachedError(
+            "the reference drive does not move, so nothing can be beside it; check the controller"
+        )
     # Beyond its end it goes on as it went in the last metre: a car that stands creeps, one that was hit turns.
     back = reference - reference[-1]
     far = np.flatnonzero(np.hypot(*back.T) >= END_M)

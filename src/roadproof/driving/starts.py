@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
+from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -70,8 +72,8 @@ class StartRange:
 
     def __post_init__(self) -> None:
         for name, most in MOST.items():
-            value: object = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= most:
+            value: Any = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) <= most:
                 raise EpisodeError(f"{name} of the starts is {value!r:.40}, expected a number from 0 to {most:g}")
             object.__setattr__(self, name, abs(value))  # -0.0 is a range, and no bound of one
 
@@ -147,8 +149,8 @@ def require_on_road(starts: StartRange, scenario: Scenario, simulator: object) -
     if not off(NOMINAL) and (found := next(filter(off, ends), None)):
         side = "left" if found.right_m < 0 else "right"
         raise EpisodeError(
-            f"starts of {scenario.name} reach {abs(found.right_m):g} m to the {side}, turned {found.turned_rad:+g} "
-            f"rad, where a wheel is off the road; make right_m or turned_rad smaller"
+            f"starts of {scenario.name} reach {abs(found.right_m):g} m to the {side} and turn by "
+            f"{abs(found.turned_rad):g} rad, where a wheel is off the road; make right_m or turned_rad smaller"
         )
 
 

@@ -2,7 +2,7 @@
 
     OUT/check.json      verdict, and every case with its drives (`gate.result`)
     OUT/junit.xml       a test case each, for a CI to read
-    OUT/summary.md      for people, with worst.jpg: the worst drive of what does not pass, beside the same without paint
+    OUT/summary.md      for people, with worst.jpg: the worst drive of what does not pass
     OUT/drives/         every drive by scenario; what is there is not driven again
     OUT/patterns/       the random and the fresh patterns, by scenario
     OUT/fresh/          the attacks of a full check
@@ -15,9 +15,10 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, cast
 
 from torch import nn
 
@@ -38,7 +39,6 @@ from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest
-from roadproof.io.known import without_addresses
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
@@ -82,6 +82,7 @@ def run_check(
             or the stored patterns'.
         ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator is not there or stopped answering.
+        EpisodeError: the range of starts reaches off the road of a scenario.
         OutputError: the folder cannot be written, or another process works in it.
     """
     before: Mapping[Key, Case] = {}
@@ -156,23 +157,30 @@ def _keep_apart(folder: Path, plan: CheckPlan) -> None:
 
 
 def architecture_of(controller: Controller) -> str:
-    """What a controller is made of, whatever it has learnt: its type, and a hash of its modules and tensors' shapes.
+    """What a controller is made of, whatever it has learnt: its type, and a hash of its layers and tensors' shapes.
 
-    Of one that is no module, those that it keeps as attributes count.
+    Of one that is no module, the modules count that its attributes are or hold.
     """
     name = type(controller).__qualname__
-    fields = getattr(controller, "__dict__", {})
-    kept = {"": controller} if isinstance(controller, nn.Module) else fields
-    modules = {key: value for key, value in kept.items() if isinstance(value, nn.Module)}
-    if not modules:
+    kept = [controller] if isinstance(controller, nn.Module) else _modules_in(getattr(controller, "__dict__", {}))
+    if not kept:
         return name
-    layers = [(key, type(each).__qualname__, each.extra_repr()) for key in modules for each in modules[key].modules()]
-    shapes = [
-        (key, path, list(getattr(value, "shape", ())))
-        for key in modules
-        for path, value in modules[key].state_dict().items()
-    ]
-    return f"{name}-{digest(without_addresses(json.dumps([layers, shapes])))[:8]}"
+    layers = [type(layer).__qualname__ for module in kept for layer in module.modules()]
+    states = [(path, value) for module in kept for path, value in module.state_dict().items()]
+    shapes = [(path, list(getattr(value, "shape", ()))) for path, value in states]
+    return f"{name}-{digest(json.dumps([layers, shapes]))[:8]}"
+
+
+def _modules_in(value: object) -> list[nn.Module]:
+    """The modules that a value is or holds, in dicts, lists and tuples within each other."""
+    if isinstance(value, nn.Module):
+        return [value]
+    held: Iterable[Any] = ()
+    if isinstance(value, dict):
+        held = cast("dict[Any, Any]", value).values()
+    elif isinstance(value, list | tuple):
+        held = cast("list[Any]", value)
+    return [module for each in held for module in _modules_in(each)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.loading import load_trainable
+from roadproof.driving.starts import require_on_road
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, by_street, check_streets
 from roadproof.hardening.judgement import Judgement
@@ -104,6 +105,9 @@ def harden(
     streets = (*scenarios, *judge_on)
     for street in streets:
         check_paint(simulator, street, space, budget.attack.method)
+        spent = budget.attack if street in scenarios else budget.judge
+        if spent.starts:
+            require_on_road(spent.start_range, street, simulator)
     for each in dict.fromkeys((*streets, *clean_on)):
         require_route(simulator, each)
     network = load_trainable(controller)

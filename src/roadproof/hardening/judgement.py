@@ -90,14 +90,14 @@ class BareDrives:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BeforeAfter:
-    """Both controllers over the strongest attack on each street.
+    """Both controllers over the strongest attack on each scenario; of one street, scenarios are averaged.
 
     Args:
         change_m: deviation after less before, metres: mean with 95 % interval.
         over: what the interval is over: "streets", or with one street alone the "starts" of its drives.
-        before_m: median over streets of the mean deviation before hardening, metres.
-        after_m: median over streets of the mean deviation after hardening, metres.
-        left_lane_before: share of drives that leave the lane before hardening, 0 to 1, over the attack on each street
+        before_m: median over scenarios of the mean deviation before hardening, metres.
+        after_m: median over scenarios of the mean deviation after hardening, metres.
+        left_lane_before: share of drives that leave the lane before hardening, 0 to 1, over the attack on each scenario
             that leads most of them out of it: not always the one of the largest deviation.
         left_lane_after: the same after hardening.
     """
@@ -207,12 +207,13 @@ class Judgement:
             _from_common_starts(self._strongest(name, after=False), self._strongest(name, after=True))
             for name in scenarios
         ]
-        if len(scenarios) > 1:
-            change = {name: np.mean(two) - np.mean(one) for name, (one, two) in zip(scenarios, pairs, strict=True)}
-            apart = [[change[name] for name in street if name in change] for street in self._streets(scenarios)]
-            changes, over = [float(np.mean(each)) for each in apart if each], "streets"
-        else:
-            changes, over = [two - one for one, two in zip(*pairs[0], strict=True)], "starts"
+        change = {name: np.subtract(two, one) for name, (one, two) in zip(scenarios, pairs, strict=True)}
+        apart = [[change[name] for name in street if name in change] for street in self._streets(scenarios)]
+        means = [float(np.mean([np.mean(each) for each in street])) for street in apart if street]
+        # The scenarios of one street are driven from the same starts.
+        (street,) = [street for street in apart if street][:1]
+        alone = len(means) == 1 and len({len(each) for each in street}) == 1
+        changes, over = (np.mean(street, 0).tolist(), "starts") if alone else (means, "streets")
         return BeforeAfter(
             change_m=mean_95(changes),
             over=over,

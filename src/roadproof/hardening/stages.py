@@ -17,7 +17,7 @@ from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_con
 from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
 from roadproof.controllers.weights_file import tensors_of
-from roadproof.errors import EpisodeError, RecordingError, TrainingError
+from roadproof.errors import CanvasNotReachedError, TrainingError
 from roadproof.hardening.judgement import BareDrives, JudgedAttack, StreetJudge, clean_drives
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round
@@ -76,7 +76,7 @@ class HardeningStages:
                 give_back_freed_memory()
             try:
                 tests.append(self.attack(number))
-            except (EpisodeError, RecordingError) as error:
+            except CanvasNotReachedError as error:
                 if not number:
                     raise
                 cure = "other streets, another seed or fewer rounds" if number > 1 else "other streets or another seed"
@@ -154,7 +154,7 @@ class HardeningStages:
                     told = self._under(f"Judging {when}, {scenario.name}")
                     try:
                         judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
-                    except (EpisodeError, RecordingError) as error:
+                    except CanvasNotReachedError as error:
                         if not number:
                             raise
                         unjudged[scenario.name] = str(error)
@@ -245,8 +245,8 @@ def _drive_in_town(plan: HardeningPlan, number: int, town: TownSimulator, drive:
 
 
 def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
-    # What the hardened controller cannot be judged by is told where all streets are gathered.
-    with suppress(*((EpisodeError, RecordingError) if number else ())):
+    # Where the hardened controller no longer drives is told where all streets are gathered.
+    with suppress(*((CanvasNotReachedError,) if number else ())):
         StreetJudge(plan, simulator, number, scenario, _go_on).judge()
 
 

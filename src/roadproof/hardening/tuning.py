@@ -38,7 +38,7 @@ from roadproof.search_space import SearchSpace
 PEDALS = 0.3
 """What throttle and brake count in the loss, against 1 for steering."""
 
-_CURE = "mend the step, and the same call goes on, or lower Tuning.learning_rate in another folder"
+_CURE = "mend the step (in the first tuning the same call then goes on), or lower Tuning.learning_rate elsewhere"
 
 TrainingStep: TypeAlias = Callable[[nn.Module, TuningBatch], Tensor]
 """The loss of a batch, differentiable in the controller's parameters; one of the user's own, or `training_step`."""

@@ -186,7 +186,7 @@ def pictures_of(
     (episode,) = load_episodes(folder, [file])
     steps = evenly(len(episode), count).tolist()
     kept = look_again(simulator, episode, start, steps, _small, full_pictures=True)
-    return np.stack([kept[step] for step in steps])
+    return np.stack([kept[step] for step in steps if step in kept])
 
 
 def _small(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:

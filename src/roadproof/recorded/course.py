@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.driving.deviation import passage
-from roadproof.errors import RecordingError
+from roadproof.errors import CanvasNotReachedError, RecordingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.recorded.nearest import Poses
 from roadproof.recorded.vehicle import curvatures
@@ -81,7 +81,7 @@ class Course:
         x, y = track.x_m[rows] - canvas.x_m, track.y_m[rows] - canvas.y_m
         moved = np.hypot(np.diff(x), np.diff(y))
         if moved.sum() < 1.0:
-            raise RecordingError("the clean drive moves less than a metre past the canvas; check its track")
+            raise CanvasNotReachedError("the clean drive moves less than a metre past the canvas; check its track")
         seen = slice(max(seen.start - rows.start, 0), seen.stop - rows.start)
         kappa = curvatures(track, rows)
         self.seen, self.dt_s = seen, track.dt_s

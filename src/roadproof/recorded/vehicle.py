@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.errors import RecordingError
+from roadproof.errors import CanvasNotReachedError, RecordingError
 from roadproof.geometry import wrapped_rad
 from roadproof.recordings import Track
 from roadproof.traffic.agents import CAR_WHEELBASE_M
@@ -130,7 +130,7 @@ class Vehicle:
         parts = [_Rows.of(track, part, rate) for track, part in stretches]
         curving, curved = _stacked([(part.curving, part.curved) for part in parts])
         if len(curved) < _LEAST_STEPS:
-            raise RecordingError(
+            raise CanvasNotReachedError(
                 f"only {len(curved)} steps of the drives follow each other in motion, {_LEAST_STEPS} are needed to "
                 "identify the vehicle; record more, or give its wheelbase and steering range"
             )

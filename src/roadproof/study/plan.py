@@ -25,7 +25,7 @@ from roadproof.roads.maps import load_map
 from roadproof.roads.marks import site_at
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
-from roadproof.simulators.loading import check_spec
+from roadproof.simulators.loading import TOWNS, check_spec
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
 
 FORMAT = "roadproof-study"
@@ -149,8 +149,10 @@ class Study(Conditions):
         reference: name of the method that tables compare with the others; None for the first.
 
     Raises:
-        StudyError: a list is empty, something stands in it twice, or a value makes no sense.
-        EpisodeError: the starts of a seed are not all different, or one is a scenario's own.
+        StudyError: a list is empty, something stands in it twice, a value makes no sense, or limits leave no pattern.
+        EpisodeError: the starts of a seed are not all different, one is a scenario's own, or their range reaches off a
+            road of the town.
+        ScenarioError: the town has no such map.
         SimulatorError: no simulator has this name.
     """
 
@@ -194,19 +196,19 @@ class Study(Conditions):
                 raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
         if self.paint is None:
             return
-        own = self._in_town  # the marks of other maps are known when their simulator is open
-        for scenario, figures in product(self.scenarios, self.figures):
-            try:
-                site = site_at(_OwnMaps() if own else None, scenario)
-                site = self.paint.site(site if own else replace(site, marks=()))
-                self.paint.check(site, albedo=(0.0, 1.0), black=figures == BLACK, measured=False)
-            except PatternError as error:
-                raise StudyError(f"[paint] on {scenario.name}: {error}") from None
+        for scenario in self.scenarios:
+            # The marks of other maps are known when their simulator is open.
+            known = site_at(_OwnMaps(), scenario) if self._in_town else replace(site_at(None, scenario), marks=())
+            for black in sorted({figures == BLACK for figures in self.figures}):
+                try:
+                    self.paint.check(self.paint.site(known), albedo=(0.0, 1.0), black=black, measured=False)
+                except PatternError as error:
+                    raise StudyError(f"[paint] on {scenario.name}: {error}") from None
 
     @property
     def _in_town(self) -> bool:
         """Whether the maps are known before any simulator is open."""
-        return self.simulator.split(":")[0] == "town"
+        return self.simulator in TOWNS
 
     @property
     def jobs(self) -> tuple[Job, ...]:
