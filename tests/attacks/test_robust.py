@@ -145,7 +145,7 @@ def test_black_boxes_compare_patterns_in_the_same_looks(road):
 
 
 def test_the_published_search_knows_no_variation(road):
-    with pytest.raises(RoadproofError, match="not the steering shift over variations"):
+    with pytest.raises(RoadproofError, match="the published search knows no variation"):
         attack(road, PullsToBrightPaint(), SPACE, method=Published(), objective=SteeringShift(variation=Variation()))
 
 
