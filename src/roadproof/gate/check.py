@@ -28,7 +28,7 @@ from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
-from roadproof.driving.drive_store import Episodes
+from roadproof.driving.drive_store import Episodes, load_episodes
 from roadproof.driving.starts import NOMINAL, require_on_road
 from roadproof.errors import CanvasNotReachedError, CheckError
 from roadproof.gate.outputs import WORST, WORST_COLUMNS, write_junit, write_summary, write_worst
@@ -42,10 +42,11 @@ from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import STRIP, Strip, film_drives, forget_film, pictures_of
+from roadproof.pipeline.film import STRIP, STRIP_SIZE, Strip, film_drives, forget_film, pictures_at
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
+from roadproof.recordings import evenly
 from roadproof.roads.marks import site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -348,7 +349,9 @@ class _Check:
         with place.factory() as world:
             start = worst.start.of(begun_in(world, place.scenario))
             if case.kind is Kind.BARE:
-                pictures = [pictures_of(world, start, worst.clean, drives, count=WORST_COLUMNS)]
+                (episode,) = load_episodes(drives, [worst.clean])
+                steps = evenly(len(episode), WORST_COLUMNS).tolist()
+                pictures = [pictures_at(world, episode, start, steps, STRIP_SIZE)]
             else:
                 film_drives(world, start, (worst.clean, worst.painted), read_paint(Path(worst.paint)), drives)
                 strip = Strip.load(drives / STRIP)

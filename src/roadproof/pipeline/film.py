@@ -25,7 +25,6 @@ from roadproof.io.files import write_atomically
 from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
 from roadproof.processes import Pool, open_or_here
-from roadproof.recordings import evenly
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -176,21 +175,26 @@ def film_drives(
     return True
 
 
-def pictures_of(
-    simulator: Simulator, start: Scenario, file: str, folder: Path, *, count: int
+def pictures_at(
+    simulator: Simulator,
+    episode: Episode,
+    start: Scenario,
+    steps: Sequence[int],
+    size_px: tuple[int, int],
+    *,
+    pattern: PatternImage | None = None,
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    """The camera's pictures of one judged drive over the bare road, from its start to its end, at most `count`.
+    """The camera's pictures of a judged drive, of (width, height) px, at those of the steps that come before its end.
 
-    Args are those of `film_drives`.
+    The drive is replayed from its controls, in its scenario with the start that it had.
     """
-    (episode,) = load_episodes(folder, [file])
-    steps = evenly(len(episode), count).tolist()
-    kept = look_again(simulator, episode, start, steps, _small, full_pictures=True)
+    look = partial(_resized, size_px)
+    kept = look_again(simulator, episode, start, steps, look, pattern=pattern, full_pictures=True)
     return np.stack([kept[step] for step in steps if step in kept])
 
 
-def _small(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
-    return np.asarray(Image.fromarray(seen.shown).resize(STRIP_SIZE, Image.Resampling.LANCZOS))
+def _resized(size_px: tuple[int, int], seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
+    return np.asarray(Image.fromarray(seen.shown).resize(size_px, Image.Resampling.LANCZOS))
 
 
 def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, count: int) -> list[int]:

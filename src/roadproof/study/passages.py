@@ -10,12 +10,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from roadproof.datatypes import Observation
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluation import Evaluation
-from roadproof.driving.rollout import look_again
 from roadproof.driving.trial import Trial
-from roadproof.pipeline.film import passage_steps
+from roadproof.pipeline.film import passage_steps, pictures_at
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -58,9 +56,4 @@ def _strip(
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     steps = passage_steps(clean, painted, scenario.canvas, PICTURES)
     start = trial.start.of(scenario)
-    taken = look_again(simulator, painted, start, steps, _small, pattern=paint, full_pictures=True)
-    return np.concatenate([taken[step] for step in steps if step in taken], 1)
-
-
-def _small(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
-    return np.asarray(Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS))
+    return np.concatenate(list(pictures_at(simulator, painted, start, steps, SIZE_PX, pattern=paint)), 1)
