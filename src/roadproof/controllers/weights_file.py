@@ -168,7 +168,9 @@ def fill_from(path: Path, network: nn.Module) -> None:
     Raises:
         ControllerError: the file is missing or damaged, or holds the weights of another network.
     """
-    _fill(network, _read(existing(path))[0], path)
+    state, _ = _read(existing(path))
+    _check_shapes(network, state, path)
+    _fill(network, state, path)
 
 
 def _read(path: Path) -> tuple[dict[str, Shaped[Tensor, "..."]], str | None]:
@@ -199,7 +201,7 @@ def _check_shapes(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], p
 
 
 def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Path) -> None:
-    _check_shapes(network, state, path)
+    """Give a network tensors of its shapes, once their numbers are known to be some."""
     expected = network.state_dict()
     for key, tensor in state.items():
         if tensor.is_floating_point() != expected[key].is_floating_point():

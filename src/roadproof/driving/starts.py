@@ -15,7 +15,7 @@ from roadproof.errors import EpisodeError
 from roadproof.io.tables import check_range
 from roadproof.limits import check_seed
 from roadproof.roads.maps import Mapped
-from roadproof.roads.roadmap import Surface
+from roadproof.roads.roadmap import ON_ROAD
 from roadproof.scenarios import Scenario
 from roadproof.simulators.tracker.judge import wheels
 
@@ -142,7 +142,7 @@ def require_on_road(starts: StartRange, scenario: Scenario, simulator: object) -
     roads = simulator.road_map(scenario.map_name)
 
     def off(start: StartOffset) -> bool:
-        return bool(np.isin(roads.surface_at(np.array(wheels(start.of(scenario).start))), _OFF_ROAD).any())
+        return not np.isin(roads.surface_at(np.array(wheels(start.of(scenario).start))), ON_ROAD).all()
 
     sides = product((-starts.right_m, starts.right_m), (-starts.turned_rad, starts.turned_rad))
     ends = [StartOffset(right_m=aside, turned_rad=turned) for aside, turned in sides]
@@ -153,8 +153,6 @@ def require_on_road(starts: StartRange, scenario: Scenario, simulator: object) -
             f"{abs(found.turned_rad):g} rad, where a wheel is off the road; make right_m or turned_rad smaller"
         )
 
-
-_OFF_ROAD = (Surface.SIDEWALK, Surface.OTHER)
 
 USUAL_STARTS = StartRange()
 USUAL_PLAN = StartPlan()

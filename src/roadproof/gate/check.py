@@ -339,8 +339,8 @@ class _Check:
         """
         painted = [(case, worst) for case in cases if case.kind is not Kind.BARE and (worst := worst_of(case.drives))]
         wrong = [each for each in painted if each[0].status is not Status.PASSED]
-        spoilt = [(case, drive) for case in cases if case.kind is Kind.BARE for drive in case.drives if drive.wrong]
-        spoilt = [each for each in spoilt if each[0].status is not Status.PASSED]
+        not_clean = [case for case in cases if case.kind is Kind.BARE and case.status is not Status.PASSED]
+        spoilt = [(case, drive) for case in not_clean for drive in case.drives if drive.wrong]
         if not painted and not spoilt:
             return None
         case, worst = spoilt[0] if spoilt and not wrong else max(wrong or painted, key=lambda each: each[1].deviation_m)

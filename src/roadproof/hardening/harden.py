@@ -24,7 +24,6 @@ from collections.abc import Sequence
 
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.loading import load_trainable
-from roadproof.driving.starts import require_on_road
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, by_street, check_streets
 from roadproof.hardening.judgement import Judgement
@@ -37,7 +36,7 @@ from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
 from roadproof.limits import check_seed
 from roadproof.pipeline.stage_costs import Ledger
-from roadproof.pipeline.stages import OnProgress, check_paint
+from roadproof.pipeline.stages import OnProgress, check_street
 from roadproof.processes import require_opened
 from roadproof.roads.maps import require_route
 from roadproof.scenarios import Scenario
@@ -103,11 +102,9 @@ def harden(
         budget.require_libraries(space)
     require_opened(processes, factory)
     streets = (*scenarios, *judge_on)
+    budget.attack.method.check_space(space)
     for street in streets:
-        check_paint(simulator, street, space, budget.attack.method)
-        spent = budget.attack if street in scenarios else budget.judge
-        if spent.starts:
-            require_on_road(spent.start_range, street, simulator)
+        check_street(simulator, street, space, budget.attack if street in scenarios else budget.judge)
     for each in dict.fromkeys((*streets, *clean_on)):
         require_route(simulator, each)
     network = load_trainable(controller)

@@ -185,10 +185,10 @@ class Judgement:
     def verdict(self) -> HardeningVerdict:
         """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
         names = [name for name in dict.fromkeys(each.scenario for each in self.judged) if name not in self.unjudged]
-        compared = self._compared(names) if names else None
+        strongest = [(self._strongest(name, after=False), self._strongest(name, after=True)) for name in names]
+        compared = self._compared(strongest) if strongest else None
         worse = self.clean[1].clean < self.clean[0].clean
-        before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
-        lost = sum(each.left_out for each in after) - sum(each.left_out for each in before)
+        lost = sum(two.left_out - one.left_out for one, two in strongest)
         if worse or (compared is not None and compared.worse):
             outcome = "did not help"
         else:
@@ -202,18 +202,18 @@ class Judgement:
             unjudged=tuple(self.unjudged),
         )
 
-    def _compared(self, scenarios: Sequence[str]) -> BeforeAfter:
-        pairs = [
-            _from_common_starts(self._strongest(name, after=False), self._strongest(name, after=True))
-            for name in scenarios
-        ]
+    def _compared(self, strongest: Sequence[tuple[JudgedAttack, JudgedAttack]]) -> BeforeAfter:
+        """Both controllers over the strongest attack on each scenario, before and after."""
+        scenarios = [one.scenario for one, _ in strongest]
+        pairs = [_from_common_starts(one, two) for one, two in strongest]
         change = {name: np.subtract(two, one) for name, (one, two) in zip(scenarios, pairs, strict=True)}
-        apart = [[change[name] for name in street if name in change] for street in self._streets(scenarios)]
-        means = [float(np.mean([np.mean(each) for each in street])) for street in apart if street]
+        known = self.streets or [[name] for name in scenarios]
+        streets = [found for names in known if (found := [change[name] for name in names if name in change])]
         # The scenarios of one street are driven from the same starts.
-        (street,) = [street for street in apart if street][:1]
-        alone = len(means) == 1 and len({len(each) for each in street}) == 1
-        changes, over = (np.mean(street, 0).tolist(), "starts") if alone else (means, "streets")
+        if len(streets) == 1 and len({len(each) for each in streets[0]}) == 1:
+            changes, over = np.mean(streets[0], 0).tolist(), "starts"
+        else:
+            changes, over = [float(np.mean([each.mean() for each in street])) for street in streets], "streets"
         return BeforeAfter(
             change_m=mean_95(changes),
             over=over,
@@ -222,9 +222,6 @@ class Judgement:
             left_lane_before=self._left_lane(scenarios, after=False),
             left_lane_after=self._left_lane(scenarios, after=True),
         )
-
-    def _streets(self, scenarios: Sequence[str]) -> Sequence[Sequence[str]]:
-        return self.streets or [[name] for name in scenarios]
 
     def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
         return max(self._tried(scenario, after=after), key=lambda each: each.mean_m)

@@ -19,7 +19,7 @@ from roadproof.search_space import SearchSpace, derived_seed
 from roadproof.simulators.protocol import Simulator, world_of
 
 WEIGHTS = "hardened.safetensors"
-STEP_PARTS = ("training step", "training step's source")
+_STEP, _SOURCE = STEP_PARTS = ("training step", "training step's source")
 _FRESH = 1000
 """The least seed of judging; those of the rounds are below it."""
 
@@ -108,8 +108,8 @@ class HardeningPlan:
             "learnt": [repr(each) for each in self.budget.learnt(self.space)],
             "variation": repr(variation_of(attack.objective)),
             "seed": self.seed,
-            STEP_PARTS[0]: f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
-            STEP_PARTS[1]: known_by(step),
+            _STEP: f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+            _SOURCE: known_by(step),
         }
 
     def attack(

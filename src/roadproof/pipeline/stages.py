@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, Candidate, Cheapest, Method, kept_attack, kept_cheapest, parse_groups
+from roadproof.attacks import AttackResult, Candidate, Cheapest, kept_attack, kept_cheapest, parse_groups
 from roadproof.attacks.cheapest import MOST_LEVELS
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import own_objective, variation_of
@@ -17,6 +17,7 @@ from roadproof.controllers.identity import identity_of, parts_of
 from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.starts import require_on_road
 from roadproof.io.identity import digest, stated
 from roadproof.io.known import known_by, without_addresses
 from roadproof.patterns import Pattern, raster
@@ -304,13 +305,15 @@ class Stages:
         return self.folder / self.budget.recorded_in[number] if number else self.folder
 
 
-def check_paint(simulator: Simulator, scenario: Scenario, space: SearchSpace, method: Method) -> None:
-    """Check, before anything is driven, that a method can search the patterns and the limits leave some on a street.
+def check_street(simulator: Simulator, scenario: Scenario, space: SearchSpace, budget: Budget) -> None:
+    """Check, before anything is driven, that limits leave patterns on a street, and that drives start on its road.
 
     Raises:
-        PatternError: the method cannot search them, or the limits leave none.
+        PatternError: the limits leave none.
+        EpisodeError: the range of starts reaches off the road.
     """
-    method.check_space(space)
     if space.limits is not None:
         site = space.limits.site(site_at(simulator, scenario))
         space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
+    if budget.starts:
+        require_on_road(budget.start_range, scenario, simulator)

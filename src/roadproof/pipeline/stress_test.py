@@ -30,7 +30,6 @@ from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.driving.evaluation import Evaluation
-from roadproof.driving.starts import require_on_road
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import html_of, table
@@ -44,7 +43,7 @@ from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_paint
+from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_street
 from roadproof.processes import here_or_beside, require_opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
@@ -186,9 +185,7 @@ def stress_test(
         on_progress=on_progress,
     )
     check_asked(budget, stages.space, cheapest_m=cheapest_m, limit_costs=limit_costs)
-    check_paint(simulator, scenario, stages.space, budget.method)
-    if budget.starts:
-        require_on_road(budget.start_range, scenario, simulator)
+    check_street(simulator, scenario, stages.space, budget)
     view = simulator.input
     if processes > 1:
         require_picklable(controller)

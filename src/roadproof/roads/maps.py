@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
-from roadproof.roads.roadmap import RoadMap, Surface
+from roadproof.roads.roadmap import ON_ROAD, RoadMap, Surface
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
 
@@ -110,7 +110,7 @@ def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
     """
     points = canvas_points(canvas)
     codes = road_map.surface_at(points)
-    off = np.flatnonzero((codes != Surface.DRIVING) & (codes != Surface.SHOULDER))
+    off = np.flatnonzero(np.isin(codes, ON_ROAD, invert=True))
     if len(off):
         x, y = points[off[0]]
         what = Surface(int(codes[off[0]])).name.lower()

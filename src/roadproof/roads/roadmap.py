@@ -38,6 +38,10 @@ class Surface(IntEnum):
     DRIVING = 3
 
 
+ON_ROAD = (Surface.SHOULDER, Surface.DRIVING)
+"""What a car stands on that is on the road."""
+
+
 PAVED = (
     *("shoulder", "border", "parking", "stop", "biking", "bidirectional", "bus", "taxi", "HOV"),
     *("entry", "exit", "mwyEntry", "mwyExit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
