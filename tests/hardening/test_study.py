@@ -1,18 +1,25 @@
-"""The study of hardening: each stage is one line, its results are one file, and its streets lie apart."""
+"""The studies of hardening: each stage is one line, results are one file, and streets lie apart."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
 
+import pytest
+
 import needs
+from roadproof.errors import TrainingError
 from roadproof.hardening.budget import check_streets
+from roadproof.hardening.judgement import StreetJudge
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import load_scenarios
 from runs import hardened
 
 needs.town()
 
-STUDY = Path(__file__).parents[2] / "studies" / "harden.py"
+STUDIES = Path(__file__).parents[2] / "studies"
+STUDY = STUDIES / "harden.py"
+AGAIN = STUDIES / "judge_again.py"
 
 
 def test_the_study_says_each_stage_once_and_writes_its_results_where_asked(tmp_path, monkeypatch, capfd):
@@ -46,3 +53,43 @@ def test_the_streets_of_the_study_lie_apart_and_its_crossings_are_painted_inside
         (crossing,) = route.crossings
         at_m = route.locate(scenario.canvas.x_m, scenario.canvas.y_m).arclength_m
         assert crossing.enters_m < at_m < crossing.leaves_m, scenario.name
+
+
+@pytest.fixture
+def judge_again(tmp_path, monkeypatch):
+    """Runs the study of other seeds with some arguments; its file."""
+
+    def run(*given):
+        written = tmp_path / "rows.json"
+        argv = [
+            str(AGAIN),
+            "--json",
+            str(written),
+            "--keep",
+            str(tmp_path / "kept"),
+            "--controller",
+            "pilotnet",
+            *given,
+        ]
+        monkeypatch.setattr(sys, "argv", argv)
+        monkeypatch.syspath_prepend(str(STUDIES))
+        runpy.run_path(str(AGAIN), run_name="__main__")
+        return json.loads(written.read_text())
+
+    return run
+
+
+def test_the_study_of_other_seeds_counts_the_attack_that_leads_most_drives_out(judge_again, monkeypatch, capfd):
+    judged = [each for each in hardened().judgement.judged if not each.after]
+    monkeypatch.setattr(StreetJudge, "judge", lambda _self: judged)
+    found = judge_again("--streets", "left-03", "--seed", "3")
+    assert (found["controller"], found["seed"], len(found["weights"])) == ("pilotnet", 3, 16)
+    assert [each["kind"] for each in found["judged"]] == ["by gradient", "random"]
+    assert all("after" not in each for each in found["judged"])
+    assert "| strongest on each street | 1.20 m (1.20–1.20) | 50% |" in (said := capfd.readouterr().out)
+    assert "Leaves its lane in 1 of 2 drives." in said
+
+
+def test_the_study_of_other_seeds_refuses_a_street_that_was_trained_on(judge_again):
+    with pytest.raises(TrainingError, match=r"left-01 is trained on and left-01 judged on"):
+        judge_again("--streets", "left-01")
