@@ -135,6 +135,17 @@ def test_the_point_of_a_pattern_makes_it_again(space):
     torch.testing.assert_close(point, starts(space), rtol=0, atol=1e-4)
 
 
+def test_colours_of_the_authors_bayesian_optimisation_end_at_250_of_255_levels():
+    space = SearchSpace(figures=2, family="published-bo")
+    brightest = space.pattern(torch.ones(2, len(space.names)))
+    torch.testing.assert_close(255 * brightest.colours, torch.full((2, 3), 250.0))
+    assert (space.point(brightest)[..., 4:] == 1).all()
+    narrower = SearchSpace(figures=1, family="published-bo", albedo=(0.2, 0.9)).pattern(torch.ones(1, 7))
+    torch.testing.assert_close(narrower.colours, torch.full((1, 3), 0.9))
+    with pytest.raises(PatternError, match=r"albedo begins at 0.99, expected less than 0.980, where colours"):
+        SearchSpace(figures=1, family="published-bo", albedo=(0.99, 1.0))
+
+
 def test_a_pattern_outside_has_the_nearest_point():
     # Figures made narrow to keep to the share lie outside the published bounds.
     space = SearchSpace(figures=3, max_painted_share=0.1)

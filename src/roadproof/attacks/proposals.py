@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from roadproof.attacks.expected_improvement import most_promising
 from roadproof.errors import RoadproofError
-from roadproof.search_space import SearchSpace, derived_seed
+from roadproof.search_space import PUBLISHED_BO_LEVELS, SearchSpace, derived_seed
 
 Cube = Float[np.ndarray, "_ d"]
 """Some points of the unit cube."""
@@ -26,7 +26,6 @@ Propose: TypeAlias = Callable[[Cube, Float[np.ndarray, " t"], int], Cube]
 PUBLISHED_ACQUISITION = {"drawn": 100_000, "climbs": 250}
 """How the authors maximise the expected improvement: random points, and runs of L-BFGS-B."""
 
-_COLOUR_RANGE = 250.0
 _CMA_SIGMA = 1 / 6
 _CMA_SIGMA_NEAR = 1 / 30
 
@@ -49,7 +48,7 @@ def random(space: SearchSpace, seed: int) -> Propose:
 
 def natural_ranges(space: SearchSpace) -> Float[np.ndarray, " d"]:
     """Range of every parameter of a published family in degrees, pixels and colour levels; all begin at 0."""
-    colours = (_COLOUR_RANGE,) * (len(space.names) - len(space.shape_ranges))
+    colours = (PUBLISHED_BO_LEVELS,) * (len(space.names) - len(space.shape_ranges))
     return np.tile((*space.shape_ranges, *colours), space.figures)
 
 

@@ -31,7 +31,7 @@ from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, met
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
 JOB_VERSION = 3
-JOB_VERSIONS = {BayesianOptimisation.word: 4, GradOpt.word: 4}
+JOB_VERSIONS = {BayesianOptimisation.word: 5, GradOpt.word: 4}
 """Raised when a job of the same settings is done differently: old results are then not taken for new ones.
 
 Digits that are rounded otherwise are no such change, though a search that climbs ends elsewhere after it, by chance.
