@@ -105,14 +105,15 @@ def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict
 
 
 def summary(name: str, each: list[dict[str, Any]]) -> dict[str, Any]:
-    """How predicted and driven numbers agree."""
+    """How predicted and driven numbers agree; None where all are the same."""
     predicted, driven = (np.array([one[key] for one in each]) for key in ("predicted_m", "driven_m"))
-    left = float(np.square(predicted - driven).sum())
+    left, spread = (float(np.square(driven - other).sum()) for other in (predicted, driven.mean()))
+    alike = not spread or not np.ptp(predicted)
     return {
         "cell": name,
         "patterns": len(each),
-        "spearman": float(spearmanr(predicted, driven)[0]),
-        "r2": 1.0 - left / float(np.square(driven - driven.mean()).sum()),
+        "spearman": None if alike else float(spearmanr(predicted, driven)[0]),
+        "r2": None if alike else 1.0 - left / spread,
         "mae_m": float(np.abs(predicted - driven).mean()),
     }
 

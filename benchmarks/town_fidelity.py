@@ -40,7 +40,7 @@ from roadproof.photometry import (
 )
 from roadproof.scenarios import Scenario, find_scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PatternImage, uniform
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
 
@@ -72,11 +72,6 @@ def shoot(
 
     episode = rollout(town, driver, scenario, weather=weather, pattern=paint, on_step=keep)
     return episode, Shots(np.stack(frames), np.stack(homographies))
-
-
-def uniform(colour: tuple[int, int, int]) -> PatternImage:
-    """A canvas painted all over."""
-    return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (*colour, 255), np.uint8)
 
 
 def covered(pattern: Pattern, shots: Shots, view: CropResize) -> np.ndarray:
@@ -118,7 +113,7 @@ def judge(
         return Shots(shots.frames[chosen], shots.image_from_canvas[chosen])
 
     bare = Shots(drive.frames[chosen], drive.image_from_canvas[chosen])
-    looks = [seen(uniform(colour)) for colour in CALIBRATION]
+    looks = [seen(uniform(*colour)) for colour in CALIBRATION]
     affine = affine_from(looks, bare, view)
     maps = pixel_maps_from_two_paints(torch.tensor(looks[WHITE].frames), torch.tensor(looks[BLACK].frames))
     methods: dict[str, tuple[ColourTransform, PixelMaps | None]] = {"affine": (affine, None), "maps": (PLAIN, maps)}

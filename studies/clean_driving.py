@@ -25,7 +25,7 @@ from rich.progress import Progress
 
 from roadproof.controllers import shipped_names
 from roadproof.controllers.shipped import shipped_weights
-from roadproof.datatypes import Command, Weather
+from roadproof.datatypes import PAPER_WEATHERS, Command
 from roadproof.io.files import write_json
 from roadproof.io.identity import digest
 from roadproof.machine import made_with
@@ -34,7 +34,6 @@ from roadproof.scenarios import Scenario, builtin_scenarios
 from roadproof.training.random_scenarios import random_scenario
 from roadproof.training.scores import BareDrive, DrivingScore, score_drives
 
-WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 AGENTS = 20
 RANDOM_WAYS = 40
 RANDOM_SEED = 99
@@ -59,7 +58,7 @@ def random_ways(map_name: str) -> list[Scenario]:
 def conditions() -> dict[str, list[BareDrive]]:
     """What is driven, by name."""
     built_in = builtin_scenarios()
-    every = {weather.value: [BareDrive(scenario=s, weather=weather) for s in built_in] for weather in WEATHERS}
+    every = {weather.value: [BareDrive(scenario=s, weather=weather) for s in built_in] for weather in PAPER_WEATHERS}
     every["traffic"] = [BareDrive(scenario=s, cars=AGENTS, pedestrians=AGENTS) for s in built_in]
     every["random ways, town"] = [BareDrive(scenario=s) for s in random_ways("town")]
     every["random ways, second town"] = [BareDrive(scenario=s) for s in random_ways("second")]

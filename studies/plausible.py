@@ -157,13 +157,17 @@ def _folder(name: str) -> str:
     return "".join(letter if letter.isalnum() else "-" for letter in name)
 
 
+def _cell(row: Row) -> tuple[object, ...]:
+    return row["controller"], row["scenario"], row["seed"]
+
+
 def _key(row: Row) -> tuple[object, ...]:
-    return row["controller"], row["scenario"], row["seed"], row["limit"]
+    return *_cell(row), row["limit"]
 
 
 def table(rows: list[Row]) -> str:
     """The cost of every limit, over cells, as Markdown."""
-    bare = {(row["controller"], row["scenario"]): row["deviation_m"] for row in rows if row["limit"] == NO_LIMIT}
+    bare = {_cell(row): row["deviation_m"] for row in rows if row["limit"] == NO_LIMIT}
     lines = [
         "| limit | cells | deviation, driven (m) | cost (m) | leave the lane | paint (m²) | contrast |",
         "|---|---|---|---|---|---|---|",
@@ -172,8 +176,7 @@ def table(rows: list[Row]) -> str:
         some = [row for row in rows if row["limit"] == name]
         if not some:
             continue
-        known = [row for row in some if (row["controller"], row["scenario"]) in bare]
-        cost = [bare[row["controller"], row["scenario"]] - row["deviation_m"] for row in known]
+        cost = [bare[_cell(row)] - row["deviation_m"] for row in some if _cell(row) in bare]
         mean = {key: np.mean([row[key] for row in some]) for key in ("deviation_m", "left_lane", "area_m2", "contrast")}
         told = f"{np.mean(cost):+.2f}" if cost else "–"
         lines.append(

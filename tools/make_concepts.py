@@ -22,6 +22,7 @@ from roadproof.calibration import CalibrationMethod
 from roadproof.compositing import view_canvas
 from roadproof.datatypes import VehicleState
 from roadproof.drives import Swerve, Trajectories, Window
+from roadproof.geometry import CANVAS_CORNERS_PX
 from roadproof.patterns import raster
 from roadproof.recorded import RecordedWorld
 from roadproof.recorded.pictures import Poses
@@ -33,7 +34,6 @@ ASIDE_M, TURNED_RAD = 0.7, 0.08
 SIZE = (500, 220)
 GAP_PX, LINE_PX = 8, 30
 ASPHALT = (112, 112, 112)
-CORNERS_PX = np.array([[-0.5, 399.5, 399.5, -0.5], [-0.5, -0.5, 399.5, 399.5], [1.0, 1.0, 1.0, 1.0]])
 
 
 def shown(frame: np.ndarray, size: tuple[int, int] = SIZE) -> Image.Image:
@@ -120,7 +120,7 @@ def main() -> None:
     composited = (255 * composite(pattern, seen)[at]).round().byte().permute(1, 2, 0).numpy()
 
     frame, view = shown(clean.frames[at]), recordings.view
-    x, y, w = clean.image_from_canvas[at] @ CORNERS_PX
+    x, y, w = clean.image_from_canvas[at] @ CANVAS_CORNERS_PX.T
     right = (x / w - view.left_px) / (view.right_px - view.left_px) * SIZE[0]
     down = (y / w - view.top_px) / (view.bottom_px - view.top_px) * SIZE[1]
     outline = list(zip(right.tolist(), down.tolist(), strict=True))

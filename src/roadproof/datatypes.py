@@ -27,7 +27,7 @@ class Command(IntEnum):
 
 
 class Weather(StrEnum):
-    """Sky, light and road of a drive. The first four are the paper's; the others are for robustness."""
+    """Sky, light and road of a drive: the paper's (`PAPER_WEATHERS`), and four more for robustness."""
 
     CLEAR_NOON = "clear-noon"
     CLOUDY_NOON = "cloudy-noon"
@@ -41,6 +41,9 @@ class Weather(StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> Weather:
         raise SimulatorError(f"weather {value!r} is unknown, expected one of {', '.join(cls)}")
+
+
+PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 
 
 @dataclass(frozen=True, slots=True)

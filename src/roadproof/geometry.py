@@ -24,6 +24,10 @@ from roadproof.io.pictures import MOST_PIXELS
 from roadproof.lens import Lens
 
 CANVAS_SIZE_PX = 400
+CANVAS_CORNERS_PX: Float[np.ndarray, "4 3"] = np.array(
+    [(x, y, 1.0) for x, y in np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * CANVAS_SIZE_PX - 0.5]
+)
+"""The canvas' corners, homogeneous: far left, far right, near right, near left."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

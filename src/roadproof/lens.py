@@ -36,12 +36,12 @@ from roadproof.errors import GeometryError
 
 LensModel = Literal["brown-conrady", "fisheye"]
 
-_NAMES: dict[LensModel, tuple[str, ...]] = {
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "brown-conrady": ("k1", "k2", "p1", "p2", "k3"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 _FARTHEST: dict[LensModel, float] = {"brown-conrady": 100.0, "fisheye": math.pi}
-_MOST = 1e3
+MOST_COEFFICIENT = 1e3
 _STEPS = 80
 _SAME = 1e-15
 _TINY = 1e-30
@@ -66,9 +66,9 @@ class Lens:
     coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.model not in _NAMES:
-            raise GeometryError(f"lens model is {self.model!r:.40}, expected {' or '.join(_NAMES)}")
-        names = _NAMES[self.model]
+        if self.model not in COEFFICIENTS:
+            raise GeometryError(f"lens model is {self.model!r:.40}, expected {' or '.join(COEFFICIENTS)}")
+        names = COEFFICIENTS[self.model]
         if type(self.coefficients) is not tuple:
             raise GeometryError(
                 f"{self.model} lens has the coefficients {self.coefficients!r:.80}, "
@@ -80,8 +80,10 @@ class Lens:
                 f"expected {len(names)}: {', '.join(names)}"
             )
         for name, value in zip(names, self.coefficients, strict=True):
-            if not abs(value) <= _MOST:
-                raise GeometryError(f"{self.model} lens has {name} {value:g}, expected −{_MOST:g} to {_MOST:g}")
+            if not abs(value) <= MOST_COEFFICIENT:
+                raise GeometryError(
+                    f"{self.model} lens has {name} {value:g}, expected −{MOST_COEFFICIENT:g} to {MOST_COEFFICIENT:g}"
+                )
 
     @property
     def radial(self) -> tuple[float, ...]:
@@ -94,7 +96,7 @@ class Lens:
         return self._named("p")
 
     def _named(self, letter: str) -> tuple[float, ...]:
-        found = dict(zip(_NAMES[self.model], self.coefficients, strict=True))
+        found = dict(zip(COEFFICIENTS[self.model], self.coefficients, strict=True))
         return tuple(found[name] for name in sorted(found) if name.startswith(letter))
 
     @property

@@ -128,6 +128,7 @@ def test_a_file_that_makes_no_sense_is_one_line(here, tmp_path, invoke, text, me
     code, printed = invoke(*command("--paint", file, "--out", tmp_path / "out"))
     assert code == 2
     assert message in printed.err
+    assert "wrong.toml" in printed.err
     assert len(printed.err.strip().splitlines()) == 1
 
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from hardening_road import SPACE, VEHICLE
-from painted_ground import RampFollower, recorded_road
+from hardening_road import SPACE
+from painted_ground import VEHICLE, RampFollower, recorded_road
 from roadproof.hardening.views import Street
 from roadproof.recorded import Vehicle
 

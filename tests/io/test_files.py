@@ -20,6 +20,7 @@ from roadproof.io.files import (
     is_plain_name,
     write_atomically,
     write_folder_atomically,
+    write_json,
 )
 from roadproof.io.locks import working_in
 from roadproof.io.tables import first_twice
@@ -172,6 +173,15 @@ def test_a_text_file_that_is_too_large_is_not_read(tmp_path):
         file.truncate(2**33)
     with pytest.raises(RoadproofError, match="it is larger than 33,554,432 bytes"):
         read_toml(tmp_path / "x.toml", RoadproofError)
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_a_number_that_nobody_could_read_is_not_written(number, tmp_path):
+    path = tmp_path / "x.json"
+    write_json(path, {"metres": 1.0})
+    with pytest.raises(OutputError, match=r"x\.json is not written: Out of range float"):
+        write_json(path, {"metres": number})
+    assert path.read_text() == '{\n "metres": 1.0\n}\n'
 
 
 def test_the_first_value_that_is_there_twice_is_found_at_once():

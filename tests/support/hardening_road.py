@@ -1,16 +1,10 @@
 """A controller on `painted_ground` that can learn not to follow paint."""
 
-import dataclasses
-
 import torch
 
 from painted_ground import MIDDLE, RampFollower
-from roadproof.recorded import Vehicle
 from roadproof.search_space import SearchSpace
 
-VEHICLE = dataclasses.replace(
-    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
-)
 SPACE = SearchSpace(figures=1, colour=False)
 
 
@@ -36,7 +30,3 @@ class RampNet(torch.nn.Module):
         black = (0.2 - road.amax(1)).clamp_min(0.0)
         seen = torch.stack([road[:, 2].mean((1, 2)), black.mean((1, 2))], 1)
         return (self.drop(self.norm(seen)) * self.weight).sum(1) + self.bias
-
-
-def ramp_net():
-    return RampNet()

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from recorded_drives import CANVAS, track
-from roadproof.geometry import CIL_CAMERA, homography_from_pose
+from roadproof.geometry import CANVAS_CORNERS_PX, CIL_CAMERA, homography_from_pose
 from roadproof.homographies import homogeneous
 
 PLAN = """
@@ -37,13 +37,12 @@ yaw_rad = 0.6
 DRIVE = '\n[[drive]]\nname = "{0}"\nside = "{0}"\ntable = "{0}.csv"\n'
 SIDES = {"clean": 0.0, "right": 1.0, "left": -1.0}
 STATED = ("x_m", "y_m", "yaw_rad", "speed_mps", "steer", "throttle")
-CORNERS_PX = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5]])
 CORNER_NAMES = [f"{corner}_{axis}" for corner in ("far_left", "far_right", "near_right", "near_left") for axis in "xy"]
 
 
 def corners(state, camera=CIL_CAMERA):
     """Where the corners of the canvas are seen, px."""
-    return camera.distorted(homogeneous(homography_from_pose(camera, state, CANVAS), CORNERS_PX)).ravel()
+    return camera.distorted(homogeneous(homography_from_pose(camera, state, CANVAS), CANVAS_CORNERS_PX[:, :2])).ravel()
 
 
 def through(lens, plan=PLAN):

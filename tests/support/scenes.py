@@ -3,13 +3,11 @@
 import numpy as np
 import torch
 
+from recorded_drives import PLAIN
 from references import approach
 from roadproof.datatypes import Control
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
-from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet, Side
-
-PLAIN = ColourTransform(AffineResponse(torch.eye(3), torch.zeros(3)))
 
 
 def road_frames(count, seed):

@@ -4,7 +4,7 @@
 
     steering shift  |∑_{f<F'} (steer_f − clean steer_f)| with F' = 80 % of the clean drive's frames; what the authors
                     gave their Bayesian optimisation. A drive that ends before adds nothing after its end.
-    path deviation  the paper's deviation in metres, which evaluations report (`driving.deviation_m`).
+    path deviation  the paper's deviation in metres, which evaluations report (`driving.deviation`).
 
 Both are taken of every drive; the objective asked for is the value.
 """

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from roadproof.calibration.compiled import canvas_shares
 from roadproof.coverage import footprint_variance
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
+from roadproof.geometry import CANVAS_CORNERS_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
 
 Pictures = Float[np.ndarray, "f h w"]
@@ -109,8 +109,7 @@ def _may_see_canvas(
 
     Beside them those near the horizon, where a footprint is as long as the road.
     """
-    low, high = -0.5, CANVAS_SIZE_PX - 0.5
-    seen = input_from_canvas @ np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])
+    seen = input_from_canvas @ CANVAS_CORNERS_PX.T
     behind = seen[:, 2:] < 1e-6
     at = seen[:, :2] / np.where(behind, 1.0, seen[:, 2:])
     least, most = at.min(2)[..., None] - _FILTER_PX, at.max(2)[..., None] + _FILTER_PX

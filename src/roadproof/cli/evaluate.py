@@ -75,9 +75,10 @@ def evaluate(
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     from roadproof.cli.progress import stages
     from roadproof.controllers import Controller
+    from roadproof.datatypes import PAPER_WEATHERS
     from roadproof.drives.worlds import open_world
-    from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
     from roadproof.driving.evaluate import evaluate as run
+    from roadproof.driving.evaluate import random_patterns
     from roadproof.driving.starts import StartRange
     from roadproof.patterns import read_paint
     from roadproof.pipeline.fidelity import measure_fidelity

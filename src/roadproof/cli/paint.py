@@ -87,7 +87,7 @@ def _paint(asked: Mapping[str, Any]) -> Paint:
 def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:
     """Limits on paint and a variation from the tables [paint] and [variation], each None where it is not there."""
     from roadproof.compositing import Variation
-    from roadproof.errors import PatternError, StudyError
+    from roadproof.errors import PatternError
     from roadproof.io.tables import build
     from roadproof.io.text import read_toml
     from roadproof.paint import PaintLimits
@@ -95,9 +95,9 @@ def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:
     content = read_toml(path, PatternError)
     for key, table in content.items():
         if key not in ("paint", "variation") or not isinstance(table, dict):
-            raise StudyError(f"{path}: {key!r:.60} is no table of it, expected [paint] and [variation]")
+            raise PatternError(f"{path}: {key!r:.60} is no table of it, expected [paint] and [variation]")
     limits, variation = content.get("paint"), content.get("variation")
     return (
-        None if limits is None else build(PaintLimits, limits, "paint", StudyError),
-        None if variation is None else build(Variation, variation, "variation", StudyError),
+        None if limits is None else build(PaintLimits, limits, f"{path}: [paint]", PatternError),
+        None if variation is None else build(Variation, variation, f"{path}: [variation]", PatternError),
     )

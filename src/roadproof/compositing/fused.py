@@ -7,7 +7,7 @@ the gradients, so that the same numbers are added in the same order every time.
 
 A figure comes as twelve numbers (b for its pattern, k for its place in it), a pixel as fourteen:
 
-    figures (b, k, 12)   as `CanvasPixels.rectangles` gives them
+    figures (b, k, 12)   as `CanvasPixels.figures` gives them
     pixels (v, 14, p)    x, y, and xx, 2·xy, yy of its footprint; clean colour, gain and bias, three each; v is 1, or b
                          where each pattern has pixels of its own
 """

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from itertools import cycle
 
-from roadproof.datatypes import Weather
+from roadproof.datatypes import PAPER_WEATHERS, Weather
 from roadproof.driving.deviation import canvas_missed
 from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Episodes, driver_in_words, make_missing
 from roadproof.driving.evaluation import ATTACK, Evaluation
@@ -26,8 +26,6 @@ from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory, begun_in, check_image
-
-PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 
 
 def evaluate(

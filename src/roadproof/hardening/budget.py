@@ -11,8 +11,7 @@ from roadproof.attacks.blackbox import BlackBox
 from roadproof.attacks.objective import varied
 from roadproof.compositing import Variation
 from roadproof.coverage import Shape
-from roadproof.datatypes import Weather
-from roadproof.driving.evaluate import PAPER_WEATHERS
+from roadproof.datatypes import PAPER_WEATHERS, Weather
 from roadproof.errors import TrainingError
 from roadproof.hardening.tuning import Tuning
 from roadproof.pipeline.budget import QUICK, Budget

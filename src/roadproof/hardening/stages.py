@@ -252,7 +252,7 @@ def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenar
 
 def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
     if stopping():
-        raise TrainingError("another street failed")
+        raise TrainingError("another of them failed")
 
 
 def _save(network: nn.Module, plan: HardeningPlan, number: int) -> None:

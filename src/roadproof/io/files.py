@@ -272,6 +272,10 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write a JSON object, whole or not at all.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written, or the object holds a number that is none, which nobody could read.
     """
-    write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    try:
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+    except ValueError as error:
+        raise OutputError(f"{path} is not written: {one_line(error)}") from None
+    write_text(path, text + "\n")

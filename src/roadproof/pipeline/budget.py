@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published, SpeedChange, SteeringShift
 from roadproof.attacks.objective import ClosedLoop
 from roadproof.calibration import CalibrationMethod
-from roadproof.datatypes import Weather
+from roadproof.datatypes import PAPER_WEATHERS, Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
-from roadproof.driving.evaluate import PAPER_WEATHERS
 from roadproof.driving.starts import USUAL_STARTS, StartRange
 from roadproof.errors import RoadproofError
 from roadproof.io.tables import each_once

@@ -84,10 +84,20 @@ class Rounds:
         """
         places = takewhile(
             lambda place: (place / "selection" / "selection.json").exists(),
-            (folder / f"round-{number}" for number in count(1)),
+            (round_folder(folder, number) for number in count(1)),
         )
         done = tuple(map(_read_round, places))
         return Rounds(first=first, done=done) if done else None
+
+
+def round_folder(folder: Path, number: int) -> Path:
+    """The folder of a round in the folder of its run; round 0 is what was done before, in the run itself."""
+    return folder / f"round-{number}" if number else folder
+
+
+def best_of(selection: Selection | None, rounds: Rounds | None) -> Selection | None:
+    """The selection that a run goes by: the best of all rounds; None where nothing was driven to choose."""
+    return selection if rounds is None else rounds.best
 
 
 def search_on(
@@ -139,7 +149,7 @@ def search_on(
     known, last, drives_of_last = _ranked(found, selection), selection, folder / "selection"
     done: list[ReRecordingRound] = []
     for number in range(1, rounds + 1):
-        place = folder / f"round-{number}"
+        place = round_folder(folder, number)
         tell = partial(_tell, on_step, per_round * (number - 1), per_round * rounds)
         tell(0, "recording")
         bare, driven = last.episodes(drives_of_last)

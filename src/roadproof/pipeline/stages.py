@@ -26,7 +26,7 @@ from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
 from roadproof.pipeline.film import film_drives
 from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts, search_without
 from roadproof.pipeline.prediction import Prediction, predict
-from roadproof.pipeline.rerecording import Rounds, search_on
+from roadproof.pipeline.rerecording import Rounds, best_of, round_folder, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
 from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
@@ -220,7 +220,7 @@ class Stages:
         self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None
     ) -> Prediction | None:
         """Predict the path of the chosen pattern, beside the one driven over it; the run folder keeps the result."""
-        chosen = selection if rounds is None else rounds.best
+        chosen = best_of(selection, rounds)
         if chosen is None or not self.budget.is_predicted:
             return None
         path = self.folder / "prediction.npz"
@@ -232,8 +232,7 @@ class Stages:
             return kept
         done = enumerate(() if rounds is None else rounds.done, 1)
         number = next((k for k, each in done if each.selection is chosen), 0)
-        place = self.folder / f"round-{number}" if number else self.folder
-        clean, painted = chosen.episodes(place / "selection")
+        clean, painted = chosen.episodes(round_folder(self.folder, number) / "selection")
         prediction = predict(recordings, self.controller, pattern, clean, painted, device=self.device)
         prediction = replace(prediction, made_of=made_of)
         prediction.save(path)

@@ -40,7 +40,7 @@ from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts, relaxed_limits
 from roadproof.pipeline.prediction import Prediction
-from roadproof.pipeline.rerecording import Rounds
+from roadproof.pipeline.rerecording import Rounds, best_of
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
 from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_street
@@ -285,5 +285,5 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None, limit_costs: b
 
 
 def _chosen(found: AttackResult, selection: Selection | None, rounds: Rounds | None) -> Pattern:
-    chosen = selection if rounds is None else rounds.best
+    chosen = best_of(selection, rounds)
     return found.pattern if chosen is None else chosen.pattern

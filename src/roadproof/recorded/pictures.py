@@ -28,7 +28,7 @@ from torch.nn.functional import grid_sample
 from roadproof.compositing.view import OwnViews, dilated, picked_pixels
 from roadproof.coverage import Footprints, footprint_px, footprint_variance
 from roadproof.errors import RecordingError
-from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
+from roadproof.geometry import CANVAS_CORNERS_PX, CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.photometry.responses import response_on
 from roadproof.recorded.light import Light
 from roadproof.recorded.nearest import LOOKING_THE_SAME_WAY, NEAREST, Apart, Gap, Poses, nearest, require_on_earth
@@ -133,9 +133,7 @@ class FrameBank:
         self._rays_from_input = self._exact(np.linalg.inv(input_from_rays))
         self._halves_from_rays = self._halves_from_px @ self._exact(input_from_rays)
         ground_from_canvas = _ground_from_canvas(self.canvas)
-        low, high = -0.5, CANVAS_SIZE_PX - 0.5
-        corners = np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])
-        self._corners = self._exact(ground_from_canvas @ corners)
+        self._corners = self._exact(ground_from_canvas @ CANVAS_CORNERS_PX.T)
         self._canvas_from_ground = self._exact(np.linalg.inv(ground_from_canvas))
 
     def _set_horizon(self) -> None:

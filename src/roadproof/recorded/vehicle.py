@@ -134,8 +134,8 @@ class Vehicle:
                 f"only {len(curved)} steps of the drives follow each other in motion, {_LEAST_STEPS} are needed to "
                 "identify the vehicle; record more, or give its wheelbase and steering range"
             )
-        a = _fitted(curving, curved, prior.curving, weight=(0.02, 0.02, 0.02, 1.0))
-        r2 = _explained(stretches, rate, a)
+        law = _fitted(curving, curved, prior.curving, weight=(0.02, 0.02, 0.02, 1.0))
+        r2 = _explained(stretches, rate, law)
         if r2 < _LEAST_R2:
             raise RecordingError(
                 f"steering explains {max(r2, 0):.0%} of the way the cars took, expected {_LEAST_R2:.0%} or more; check "
@@ -150,10 +150,10 @@ class Vehicle:
         slipping, slipped = _stacked([(part.slipping, part.slipped) for part in parts])
         e, f, g, h, j = _pull(pulling, pulled, prior.pulling)
         slope, level = _fitted(slipping, slipped, prior.slipping, weight=(0.01, 1.0)).tolist()
-        b, c, d, k = a.tolist()
+        a, b, c, k = law.tolist()
         return Vehicle(
             dt_s=dt_s,
-            curving=(b, c, d, k),
+            curving=(a, b, c, k),
             pulling=(e, f, g, h, j),
             slipping=(slope, level),
             steer_rate_per_s=rate,

@@ -350,10 +350,10 @@ class RecordedWorld:
         changes = share * change.mean(1).view(-1, starts)
         return Predicted(np.array(deviations).reshape(-1, starts), changes.cpu().numpy())
 
-    def begin(self, starts: tuple[BiasedStart, ...] = (BiasedStart(),), repeats: int = 1) -> Motion:
-        """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""
+    def begin(self, starts: tuple[BiasedStart, ...] = (BiasedStart(),)) -> Motion:
+        """Cars at the first recorded frame of the clean drive, one for each start."""
         course, first = self.course, self.course.first
-        right, turned, faster, _ = self._offsets_of(starts).repeat(repeats, 1).unbind(1)
+        right, turned, faster, _ = self._offsets_of(starts).unbind(1)
         yaw = course.poses.yaw_rad[first]
         o = torch.zeros_like(right)
         return Motion(

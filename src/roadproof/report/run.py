@@ -30,6 +30,7 @@ from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
 from roadproof.pipeline.limit_costs import LIMIT_COSTS, LimitCosts
 from roadproof.pipeline.prediction import Prediction
+from roadproof.pipeline.rerecording import round_folder
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import StageCost, read_cost
 from roadproof.pipeline.stages import CHEAPEST
@@ -185,9 +186,8 @@ def read_run(folder: Path) -> Run:
 
 
 def _selections(folder: Path) -> tuple[Selection, ...]:
-    places = chain((folder,), (folder / f"round-{number}" for number in count(1)))
-    chosen = (place / "selection" for place in places)
-    return tuple(map(Selection.load, takewhile(lambda place: (place / "selection.json").exists(), chosen)))
+    places = (round_folder(folder, number) / "selection" for number in count())
+    return tuple(map(Selection.load, takewhile(lambda place: (place / "selection.json").exists(), places)))
 
 
 def _searched(folder: Path, file: str) -> Path | None:

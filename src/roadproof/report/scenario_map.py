@@ -10,6 +10,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 
 from roadproof.errors import OutputError, ScenarioError
+from roadproof.geometry import CANVAS_CORNERS_PX
 from roadproof.io.files import write_atomically
 from roadproof.report.plots import show_as_it_is
 from roadproof.report.road_view import DAYLIGHT, Points, draw_road, in_world, plan_of
@@ -62,8 +63,7 @@ def _draw_scenario(axes: Axes, scenario: Scenario, way: Points, taken: list[tupl
     axes.plot(way[0, 0], way[0, 1], "o", color=colour, markersize=5.5, markeredgecolor="white", zorder=7)
     arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.6}
     axes.annotate("", xy=tuple(way[-1]), xytext=tuple(way[-5:][0]), arrowprops=arrow, zorder=7)
-    corners = [(-0.5, -0.5, 1.0), (399.5, -0.5, 1.0), (399.5, 399.5, 1.0), (-0.5, 399.5, 1.0)]
-    outline = (corners @ canvas.world_from_canvas.T)[:, :2]
+    outline = (CANVAS_CORNERS_PX @ canvas.world_from_canvas.T)[:, :2]
     axes.fill(*outline.T, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=1.0, zorder=4)
     x, y = _label_place(scenario, taken)
     taken.append((x, y))

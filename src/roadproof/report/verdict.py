@@ -18,7 +18,7 @@ from roadproof.report.formatting import UNKNOWN, in_words, mean_in_words
 from roadproof.report.run import Run
 
 DEVIATES_M = 0.5
-"""Half a metre aside and a car of ordinary width is over the line of an ordinary lane."""
+"""A car that is so far aside in some drive, and leaves its lane in none, is said to deviate."""
 
 
 @dataclass(frozen=True, slots=True)

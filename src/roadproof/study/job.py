@@ -25,6 +25,7 @@ from roadproof.io.arrays import packed
 from roadproof.paint import Site, conspicuousness
 from roadproof.patterns import Pattern, raster, save_pattern
 from roadproof.pipeline.budget import STEERING, Budget
+from roadproof.pipeline.rerecording import best_of
 from roadproof.pipeline.selection import first_of_each_group
 from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.recordings import load_recordings
@@ -138,7 +139,7 @@ def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: P
     before = [found.cost[stage] for stage in ("record", "calibrate")]
     # All steps cost much the same, so the time of the search is spread evenly over them.
     steps = found.cost["attack"].seconds * np.arange(1, len(strongest) + 1) / len(strongest)
-    chosen = found.selection if found.rounds is None else found.rounds.best
+    chosen = best_of(found.selection, found.rounds)
     history = History(
         kind="predicted" if budget.is_predicted else "surrogate",
         calls=(sum(cost.simulator_calls for cost in before),) * len(strongest),

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from roadproof.datatypes import VehicleState
 
 CAR_LENGTH_M, CAR_WIDTH_M, CAR_WHEELBASE_M = 4.5, 1.9, 2.8
+MAX_STEER_RAD = 0.65
 """An ordinary car's: that of the controller, and of others."""
 
 CAR_DISC_M = 1.0

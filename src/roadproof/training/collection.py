@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from roadproof.controllers import Controller
 from roadproof.controllers.waypoint import PATH_M
-from roadproof.datatypes import Command, Control, Observation, VehicleState, Weather
+from roadproof.datatypes import PAPER_WEATHERS, Command, Control, Observation, VehicleState, Weather
 from roadproof.driving.rollout import Policy, policy_of, rollout
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
@@ -39,7 +39,7 @@ STEP_S = 0.1
 FURTHEST_M = 2.6
 STILL_S = 2.0
 COMMANDS = (Command.LEFT, Command.RIGHT, Command.STRAIGHT, Command.LEFT, Command.RIGHT, Command.FOLLOW)
-WEATHERS = (*tuple(Weather)[:4] * 2, *tuple(Weather)[4:])
+WEATHERS = (*PAPER_WEATHERS * 2, *(weather for weather in Weather if weather not in PAPER_WEATHERS))
 """The paper's four weathers twice as often as the others."""
 
 MAP_NAME = "town"

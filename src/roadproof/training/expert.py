@@ -22,6 +22,7 @@ from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WHEELBASE_M,
     CAR_WIDTH_M,
+    MAX_STEER_RAD,
     NOBODY,
     Agents,
     first_in_way,
@@ -29,7 +30,6 @@ from roadproof.traffic.agents import (
     obstacles,
 )
 
-MAX_STEER_RAD = 0.65
 FULL_THROTTLE_MPS2 = 4.2
 FULL_BRAKE_MPS2 = 7.9
 DRAG_PER_S = 0.025

@@ -7,9 +7,8 @@ from roadproof.datatypes import Event
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 
 needs.town()
-from roadproof.simulators.town import physics
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.training.expert import MAX_STEER_RAD, Expert
+from roadproof.training.expert import Expert
 
 SCENARIOS = builtin_scenarios()
 FEW = [find_scenario(name, SCENARIOS) for name in ("straight-16", "left-03", "right-11")]
@@ -42,7 +41,3 @@ def test_the_expert_completes_scenarios_of_every_kind_among_cars_and_people(town
         arrived, events, _ = driven(town, scenario, 20, 1)
         assert arrived
         assert events == []
-
-
-def test_the_expert_knows_the_car_it_drives() -> None:
-    assert MAX_STEER_RAD == physics.MAX_STEER_RAD

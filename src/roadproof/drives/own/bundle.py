@@ -33,10 +33,8 @@ from scipy.spatial.transform import Rotation
 
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.homographies import homography_from_points
-from roadproof.lens import Lens, LensModel
+from roadproof.lens import COEFFICIENTS, MOST_COEFFICIENT, Lens, LensModel
 
-_COEFFICIENTS: dict[LensModel, int] = {"brown-conrady": 5, "fisheye": 4}
-_MOST_COEFFICIENT = 1e3
 _MOST_STEPS = 40
 _LEAST_NOISE_PX = 0.02  # no corner is found better; without noise nothing would seem open
 _STEP = 1e-6
@@ -81,12 +79,12 @@ class Bundle:
     ) -> None:
         self.model: LensModel = model
         self.seen_px, self.grid, self.centre_px = seen_px, grid, centre_px
-        self.coefficients = slice(1, 1 + _COEFFICIENTS[model])
-        self.middle = slice(1 + _COEFFICIENTS[model], 3 + _COEFFICIENTS[model])
+        self.coefficients = slice(1, 1 + len(COEFFICIENTS[model]))
+        self.middle = slice(1 + len(COEFFICIENTS[model]), 3 + len(COEFFICIENTS[model]))
 
     def lens(self, shared: Float[np.ndarray, " s"]) -> Lens:
         """The lens that s holds, its coefficients within what a lens may have: a search may leave it on its way."""
-        coefficients = shared[self.coefficients].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
+        coefficients = shared[self.coefficients].clip(-MOST_COEFFICIENT, MOST_COEFFICIENT)
         return Lens(model=self.model, coefficients=tuple(coefficients.tolist()))
 
     def shown(

@@ -26,7 +26,7 @@ from roadproof.drives.own.table import CORNERS, POSE, Table, read_table
 from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import CANVAS_SIZE_PX, homography_from_pose
+from roadproof.geometry import CANVAS_CORNERS_PX, homography_from_pose
 from roadproof.homographies import Homography, apply_homography, homogeneous, homography_from_points
 from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
@@ -40,7 +40,7 @@ _LEAST_MPS = 1.0
 WINDOW = Window(frames=40, least_px=8)
 """Frames that are kept of a drive, as a recording for the recorded world has them."""
 
-_CORNERS_PX = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * CANVAS_SIZE_PX - 0.5
+_CORNERS_PX = CANVAS_CORNERS_PX[:, :2]
 
 
 def import_drives(folder: AnyPath) -> RecordingSet:

@@ -157,7 +157,7 @@ def _albedo(raster: _Raster, surface: Image.Image, tracks: Plane, edges: Plane) 
 
 
 def _mended(raster: _Raster) -> Plane:
-    """Rectangles of newer asphalt and sealed cracks, 0 or 1."""
+    """Rectangles of newer asphalt, 0 or 1."""
     rng = np.random.default_rng(SEED + 3)
     image = raster.blank()
     pen = ImageDraw.Draw(image)

@@ -23,6 +23,8 @@ PAINTS: tuple[Rgb, ...] = (
     (0.90, 0.90, 0.88), (0.42, 0.43, 0.45), (0.24, 0.34, 0.28), (0.70, 0.58, 0.40),
 )  # fmt: skip
 """Car colours, as often as on the road: mostly greys."""
+CAR_HALF_M = (2.25, 0.93)
+"""Half the length and width of the box that stops others at any of these cars."""
 
 
 class Body(IntEnum):

@@ -16,20 +16,19 @@ from jaxtyping import Float
 from roadproof.datatypes import Control, VehicleState
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
+from roadproof.simulators.town.models import CAR_HALF_M
 from roadproof.simulators.town.scenery import Solid
 from roadproof.simulators.tracker.judge import HEIGHT_M, TRACK_M, Contact
-from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M
+from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M, MAX_STEER_RAD
 
 WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0
-MAX_STEER_RAD = 0.65
 STEER_RATE_RAD_S = 2.5
 TRACTION_N, POWER_W = 6500.0, 95_000.0
 ROLLING_N, DRAG_N_S2_PER_M2 = 220.0, 0.42
 BRAKING_MPS2 = 8.0
 SUBSTEP_S = 0.01
 SETTLE_STEPS = 60
-CAR_HALF_M = (2.25, 0.93)
 TOUCH_M = 0.02
 TOUCHABLE_M = 40.0
 BLOCK_M = 30.0

@@ -15,7 +15,7 @@ from roadproof.roads.lanes import Lane
 from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import FACE, UNIT, Mesh, MeshBuilder, Pose, Rgb
-from roadproof.simulators.town.models import PAINTS, Body, car
+from roadproof.simulators.town.models import CAR_HALF_M, PAINTS, Body, car
 
 SEED = 40
 MARGIN_M = 45.0
@@ -345,7 +345,7 @@ def _drive(site: _Site, edge: _Edge, station: float, gap: float, length: float) 
         site.builder("plain").add(
             spot.place(mesh.points), mesh.normals @ spot.rotation.T, mesh.uv, mesh.albedo, mesh.triangles
         )
-        site.solids.append(Solid("parked car", spot, (2.25, 0.93), 1.4))
+        site.solids.append(Solid("parked car", spot, CAR_HALF_M, 1.4))
 
 
 def _lamps(site: _Site, edge: _Edge) -> None:

@@ -125,7 +125,7 @@ SKIES: dict[Weather, Sky] = {
 
 
 @lru_cache(maxsize=len(SKIES))
-def sky_picture(sky: Sky, seed: int = 20) -> UInt8[np.ndarray, "h w 3"]:
+def sky_picture(sky: Sky) -> UInt8[np.ndarray, "h w 3"]:
     """The sky all around: columns are azimuth from x towards y, rows go from the zenith to the horizon."""
     height, width = 256, 1024
     up = np.linspace(1, 0, height, dtype=np.float32)[:, None]
@@ -133,9 +133,9 @@ def sky_picture(sky: Sky, seed: int = 20) -> UInt8[np.ndarray, "h w 3"]:
     blend = (up**0.55)[..., None]
     image = np.repeat(np.array(sky.horizon) * (1 - blend) + np.array(sky.zenith) * blend, width, axis=1)
     cover = 0.62 - 0.24 * sky.clouds
-    noise = fractal_noise(height, width, seed=seed, cells=6, octaves=6)
+    noise = fractal_noise(height, width, seed=20, cells=6, octaves=6)
     cloud = (np.clip((noise - cover) / 0.20, 0, 1) * np.clip(up * 9, 0, 1))[..., None] * 0.85
-    shade = (0.82 + 0.36 * fractal_noise(height, width, seed=seed + 1, cells=8, octaves=6))[..., None]
+    shade = (0.82 + 0.36 * fractal_noise(height, width, seed=21, cells=8, octaves=6))[..., None]
     image = image * (1 - cloud) + cloud * np.array(sky.cloud_light) * shade
     sun = sky.to_sun
     elevation = up * (math.pi / 2)
@@ -145,8 +145,8 @@ def sky_picture(sky: Sky, seed: int = 20) -> UInt8[np.ndarray, "h w 3"]:
         image = image + towards**60 * np.array(sky.sunlight) * 0.55 + towards**1200 * 1.2
     else:
         image = image + towards**8 * np.array(sky.sunlight) * 0.5
-    line = 0.010 + 0.024 * fractal_noise(16, width, seed=seed + 2, cells=2, octaves=3)[3]
-    line += 0.020 * fractal_noise(64, width, seed=seed + 3, cells=8, octaves=4, persistence=0.8)[5]
+    line = 0.010 + 0.024 * fractal_noise(16, width, seed=22, cells=2, octaves=3)[3]
+    line += 0.020 * fractal_noise(64, width, seed=23, cells=8, octaves=4, persistence=0.8)[5]
     seen = math.exp(-sky.density_per_m * 260)
     far = np.array([0.23, 0.28, 0.22]) * np.sqrt(np.array(sky.skylight)) * 1.2
     woods = np.array(sky.haze) * (1 - seen) + far * seen
