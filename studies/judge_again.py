@@ -1,11 +1,12 @@
 """Does a hardened controller withstand attacks of another seed, and on streets of another town?
 
-    python studies/judge_again.py --json OUT --keep FOLDER [--controller cil-hardened] [--seed 1]
+    python studies/judge_again.py --controller CONTROLLER --seed N --json OUT --keep FOLDER
         [--scenarios studies/scenarios/second-town.toml] [--streets right-11]
 
 Each of the twelve streets that `studies/harden.py` judges on, or of any others that it does not train on, is attacked
-afresh with the searches of its judging: by gradient, by a black box and with ellipses, and driven over from other
-starts. FOLDER keeps everything, and an interrupted study goes on there.
+afresh with the searches of its judging: by gradient, by a black box and with ellipses. With the seed of a hardening
+these are its searches and starts, with any other one fresh ones. What was found against another controller before is
+not driven over. FOLDER keeps everything, and an interrupted study goes on there.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ import numpy as np
 
 from harden import CROSSINGS, JUDGE_ON, TRAIN_ON, in_words, streets
 from roadproof.cli.progress import stages
-from roadproof.controllers.shipped import shipped_weights
+from roadproof.errors import CanvasNotReachedError
 from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
 from roadproof.hardening.judgement import JudgedAttack, StreetJudge
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.io.files import write_json
-from roadproof.io.identity import digest
 from roadproof.io.records import plain
 from roadproof.machine import keep_freed_memory, made_with
 from roadproof.scenarios import find_scenario, load_scenarios
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
+from roadproof.study.plan import weights_digest
 
 
 def main() -> None:
@@ -36,8 +37,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True, help="file for the results")
     parser.add_argument("--keep", type=Path, required=True, help="folder that keeps everything")
-    parser.add_argument("--controller", default="cil-hardened", help="shipped controller that is judged")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--controller", required=True, help="controller that is judged")
+    parser.add_argument("--seed", type=int, required=True, help="seed of the searches and of the starts")
     parser.add_argument("--scenarios", type=Path, help="TOML file of scenarios; by default the built-in ones")
     parser.add_argument("--streets", nargs="+", help="names; by default all of the file, or harden.py's held-out ones")
     given = parser.parse_args()
@@ -54,21 +55,29 @@ def main() -> None:
         seed=given.seed,
         device="cpu",
     )
+    weights = weights_digest(given.controller)
     keep_freed_memory()
     judged: list[JudgedAttack] = []
+    unjudged: dict[str, str] = {}
     with open_simulator("town") as town, stages() as show:
         for street in asked:
-            judged += StreetJudge(plan, town, 0, street, show).judge()
+            try:
+                judged += StreetJudge(plan, town, 0, street, show).judge()
+            except CanvasNotReachedError as reason:
+                unjudged[street.name] = str(reason)
     rows = [{key: value for key, value in asdict(each).items() if key != "after"} for each in judged]
     found = {
         "made_with": made_with(),
         "controller": given.controller,
-        "weights": digest(shipped_weights(given.controller).read_bytes())[:16],
+        "weights": weights,
         "seed": given.seed,
         "judged": plain(rows),
+        "unjudged": unjudged,
     }
     write_json(given.json, found)
     print(table(judged))
+    for name, reason in unjudged.items():
+        print(f"{name} could not be judged: {reason}")
 
 
 def table(judged: list[JudgedAttack]) -> str:
@@ -80,7 +89,10 @@ def table(judged: list[JudgedAttack]) -> str:
     # As the verdict of a hardening counts it: the attack that leads most drives out of their lane, street by street.
     left = [out for each in on_street.values() for out in max((one.left_lane for one in each), key=np.mean)]
     head = ["| kind of attack | median (range) | leaves its lane |", "|---|---|---|"]
-    return "\n".join([*head, *rows, "", f"Leaves its lane in {sum(left)} of {len(left)} drives."])
+    told = f"Leaves its lane in {sum(left)} of {len(left)} drives."
+    if lost := sum(each.left_out for each in judged):
+        told += f" In {lost} more of all kinds it never came to the canvas."
+    return "\n".join([*head, *rows, "", told])
 
 
 if __name__ == "__main__":

@@ -140,6 +140,9 @@ def test_colours_of_the_authors_bayesian_optimisation_end_at_250_of_255_levels()
     brightest = space.pattern(torch.ones(2, len(space.names)))
     torch.testing.assert_close(255 * brightest.colours, torch.full((2, 3), 250.0))
     assert (space.point(brightest)[..., 4:] == 1).all()
+    # What a file says of the space tells it from one of another bound.
+    assert "albedo=(0.0, 0.98" in repr(space)
+    assert space.stated["albedo"] == space.albedo
     narrower = SearchSpace(figures=1, family="published-bo", albedo=(0.2, 0.9)).pattern(torch.ones(1, 7))
     torch.testing.assert_close(narrower.colours, torch.full((1, 3), 0.9))
     with pytest.raises(PatternError, match=r"albedo begins at 0.99, expected less than 0.980, where colours"):

@@ -118,25 +118,25 @@ class SearchSpace:
                 raise PatternError(
                     f"albedo is {self.albedo!r:.80}, expected a tuple of two numbers, 0 ≤ lowest < highest ≤ 1"
                 )
-        if self._channel[0] >= self._channel[1]:
-            raise PatternError(
-                f"albedo begins at {self.albedo[0]}, expected less than {self._channel[1]:.3f}, where colours of the "
-                f"{self.family} family end"
-            )
+        if self.family == "published-bo":
+            self._end_as_published()
         if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
             raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
+
+    def _end_as_published(self) -> None:
+        brightest = PUBLISHED_BO_LEVELS / 255
+        if self.albedo[0] >= brightest:
+            raise PatternError(
+                f"albedo begins at {self.albedo[0]}, expected less than {brightest:.3f}, where colours of the "
+                f"{self.family} family end"
+            )
+        object.__setattr__(self, "albedo", (self.albedo[0], min(self.albedo[1], brightest)))
 
     def __repr__(self) -> str:
         # Runs and running searches are known by it; what limits nothing is not named, as before there were limits.
         names = [each.name for each in fields(self) if each.name not in ("limits", "site")]
         names += [name for name in ("limits", "site") if getattr(self, name) is not None]
         return f"SearchSpace({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
-
-    @property
-    def _channel(self) -> tuple[float, float]:
-        """Lowest and highest value of a colour channel."""
-        darkest, brightest = self.albedo
-        return darkest, min(brightest, PUBLISHED_BO_LEVELS / 255) if self.family == "published-bo" else brightest
 
     def on(self, site: Site) -> SearchSpace:
         """The space with its limits applied to a stretch of road; a space without limits is unchanged.
@@ -147,7 +147,7 @@ class SearchSpace:
         if self.limits is None:
             return self
         known = self.limits.site(site)
-        self.limits.check(known, albedo=self._channel, black=not self.colour)
+        self.limits.check(known, albedo=self.albedo, black=not self.colour)
         return replace(self, site=known)
 
     @property
@@ -212,13 +212,13 @@ class SearchSpace:
         if self.shape is Shape.TRIANGLE:
             # A triangle looks the same only after a full turn.
             boxes = boxes / constant(_HALF_TURN, boxes)
-        darkest, brightest = self._channel
+        darkest, brightest = self.albedo
         shares = unit[..., len(parameters) :] if self.colour else torch.zeros_like(unit[..., :3])
         pattern = Pattern((self.shape,) * self.figures, boxes, darkest + shares * (brightest - darkest))
         if self.limits is not None:
             if self.site is None:
                 raise PatternError("limits on paint hold on a stretch of road; say which, by space.on(site)")
-            return self.limits.applied(pattern, self.site, albedo=self._channel, max_share=self.max_painted_share)
+            return self.limits.applied(pattern, self.site, albedo=self.albedo, max_share=self.max_painted_share)
         return pattern if self.max_painted_share is None else shrunk(pattern, self.max_painted_share)
 
     def point(self, pattern: Pattern) -> Float[Tensor, "*b k n"]:
@@ -241,7 +241,7 @@ class SearchSpace:
         natural = boxes if self.family == "free" else published_from_boxes(boxes, rotate_about=self._rotate_about)
         low = natural.new_tensor([p.low for p in parameters])
         unit = (natural - low) / natural.new_tensor(self.shape_ranges)
-        darkest, brightest = self._channel
+        darkest, brightest = self.albedo
         colours = (pattern.colours - darkest) / (brightest - darkest)
         return self.project(torch.cat([unit, colours], -1) if self.colour else unit)
 

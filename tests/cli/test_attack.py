@@ -12,7 +12,7 @@ from PIL import Image, ImageColor
 from typer.testing import CliRunner
 
 from command import stored
-from roadproof.attacks import AttackResult, Published, methods
+from roadproof.attacks import METHODS, AttackResult, Published, methods
 from roadproof.attacks.gradopt import Rung
 from roadproof.cli import app
 from roadproof.patterns import load_pattern, raster
@@ -105,6 +105,7 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
         ["--method", "published", "--family", "published-canvas-centre"],
         ["--method", "published", "--masks", "antialiased", "--black"],
         ["--method", "random", "--calls", "8"],
+        ["--method", "published-bo", "--calls", "4"],
     ],
     ids=" ".join,
 )
@@ -115,10 +116,13 @@ def test_every_kind_of_search_runs(here, tmp_path, options, monkeypatch):
     small = " ".join(command("--out", str(tmp_path), *options))
     if "--method" in options:
         small = small.replace("--iterations 4", "")
-    if "random" in options:
+    if "--calls" in options:
         small = small.replace("--restarts 2", "")
     outcome = CliRunner().invoke(app, small.split())
     assert outcome.exit_code == 0, outcome.output
+    searched = METHODS[options[1] if "--method" in options else "gradopt"]
+    family = options[options.index("--family") + 1] if "--family" in options else searched.family
+    assert AttackResult.load(tmp_path).space.family == family
 
 
 def damaged(here, tmp_path, change):

@@ -286,6 +286,14 @@ def test_mistakes_are_named(tmp_path, before, after, message):
     assert "\n" not in str(caught.value)
 
 
+def test_colours_that_the_published_baseline_had_not_leave_it_no_paint(tmp_path):
+    white = TEXT.replace('"1-b", ', "").replace("[traffic]", '[paint]\ncolours = ["#ffffff"]\n\n[traffic]')
+    with pytest.raises(StudyError, match=r"\[paint\] on left-01: none of the colours #ffffff is left"):
+        load_study(written(tmp_path, white))
+    alone = white[: white.index('[[method]]\nname = "BO"')]
+    assert len(load_study(written(tmp_path, alone)).methods) == 1
+
+
 def test_a_study_that_is_not_there_is_named(tmp_path):
     with pytest.raises(StudyError, match="cannot read"):
         load_study(tmp_path / "none.toml")

@@ -47,7 +47,6 @@ class BlackBox(Method):
     """
 
     by_gradient: ClassVar[bool] = False
-    family: ClassVar[Family] = "published"
     at_once: ClassVar[int] = AT_ONCE
     calls: int = 1000
 

@@ -12,15 +12,19 @@ from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group, parse_group
 from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SpeedChange
 from roadproof.controllers import Controller
 from roadproof.recordings import RecordingSet
-from roadproof.search_space import SearchSpace
+from roadproof.search_space import Family, SearchSpace
 
 
 class Method:
-    """A way to search for the pattern of largest value; it uses gradients unless a subclass says otherwise."""
+    """A way to search for the pattern of largest value; it uses gradients unless a subclass says otherwise.
+
+    `family` is where its figures lie where nothing else is said.
+    """
 
     __slots__ = ()
     word: ClassVar[str]
     by_gradient: ClassVar[bool] = True
+    family: ClassVar[Family] = "published"
 
     def steps(self, objective: Objective, /) -> int:
         """Number of the last step of a search for an objective."""

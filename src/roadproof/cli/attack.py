@@ -28,8 +28,12 @@ def attack(
     controller: options.ControllerSpec,
     figures: options.Figures = 5,
     family: Annotated[
-        str, typer.Option(help="Where figures may lie: published, published-canvas-centre, published-bo or free.")
-    ] = "published",
+        str | None,
+        unset(
+            "Where figures may lie: published, published-canvas-centre, published-bo or free.",
+            default="published; that of its authors for the method published-bo",
+        ),
+    ] = None,
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
     albedo: Annotated[tuple[float, float], number("Darkest and brightest paint.", 0.0, 1.0)] = (0.0, 1.0),
@@ -103,17 +107,17 @@ def attack(
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
 
+    given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
+    searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     space = SearchSpace(
         figures=figures,
-        family=options.choice(family, "family", FAMILIES),
+        family=searched.family if family is None else options.choice(family, "family", FAMILIES),
         shape=Shape(options.choice(shape, "shape", tuple(Shape))),
         colour=not black,
         albedo=albedo,
         max_painted_share=max_painted_share,
         limits=paint.limits,
     )
-    given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
-    searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     searched.check_space(space)
     drives = load_recordings(recordings)
     chosen_goal = None if objective is None else OBJECTIVES[options.choice(objective, "objective", tuple(OBJECTIVES))]

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from roadproof.attacks import BayesianOptimisation, site_of
+from roadproof.attacks import site_of
 from roadproof.attacks.blackbox import blackbox_search
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.objective import OBJECTIVES, varied
@@ -34,7 +34,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import History, Progress
-from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
+from roadproof.study.methods import BlackBoxPlan, black_box, budget_of, family_of
 from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job, TrafficPlan, weights_digest
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
@@ -123,8 +123,8 @@ def _check_files(job: Job, key: str) -> None:
 
 
 def space_of(job: Job) -> SearchSpace:
-    """The patterns a job searches: published rectangles, in its own bounds for the published baseline."""
-    family = BayesianOptimisation.family if job.method.search == BayesianOptimisation.word else "published"
+    """The patterns a job searches."""
+    family = family_of(job.method)
     if job.figures == BLACK:
         return SearchSpace(figures=1, family=family, colour=False, limits=job.paint)
     return SearchSpace(figures=int(job.figures), family=family, limits=job.paint)

@@ -20,6 +20,7 @@ from roadproof.errors import StudyError
 from roadproof.io.tables import build
 from roadproof.limits import MANY
 from roadproof.pipeline.budget import PUBLISHED, QUICK, Budget
+from roadproof.search_space import Family
 
 # What begins a number is checked by the object that it goes into; a plan may come from anyone, so it also has an end.
 Hundred: TypeAlias = Annotated[int, msgspec.Meta(le=100)]
@@ -110,6 +111,11 @@ class BlackBoxPlan:
 
 
 MethodPlan: TypeAlias = GradOptPlan | PublishedPlan | BlackBoxPlan
+
+
+def family_of(method: MethodPlan) -> Family:
+    """Where the figures of a method lie: published rectangles, in bounds of its own for the published baseline."""
+    return METHODS[method.search].family
 
 
 def method_plan(values: Mapping[str, Any]) -> MethodPlan:

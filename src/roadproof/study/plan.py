@@ -25,8 +25,9 @@ from roadproof.roads.maps import load_map
 from roadproof.roads.marks import site_at
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
+from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import TOWNS, check_spec
-from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
+from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, family_of, method_plan
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -199,9 +200,14 @@ class Study(Conditions):
         for scenario in self.scenarios:
             # The marks of other maps are known when their simulator is open.
             known = site_at(_OwnMaps(), scenario) if self._in_town else replace(site_at(None, scenario), marks=())
-            for black in sorted({figures == BLACK for figures in self.figures}):
+            spaces = {
+                SearchSpace(figures=1, family=family_of(method), colour=figures != BLACK)
+                for method, figures in product(self.methods, self.figures)
+            }
+            for space in sorted(spaces, key=repr):
                 try:
-                    self.paint.check(self.paint.site(known), albedo=(0.0, 1.0), black=black, measured=False)
+                    known_site, black = self.paint.site(known), not space.colour
+                    self.paint.check(known_site, albedo=space.albedo, black=black, measured=False)
                 except PatternError as error:
                     raise StudyError(f"[paint] on {scenario.name}: {error}") from None
 

@@ -10,8 +10,9 @@ from jaxtyping import Float, Int
 from roadproof.datatypes import VehicleState
 
 CAR_LENGTH_M, CAR_WIDTH_M, CAR_WHEELBASE_M = 4.5, 1.9, 2.8
-MAX_STEER_RAD = 0.65
 """An ordinary car's: that of the controller, and of others."""
+MAX_STEER_RAD = 0.65
+"""How far its front wheels turn to either side."""
 
 CAR_DISC_M = 1.0
 CAR_DISCS_M = (-1.6, 0.0, 1.6)
