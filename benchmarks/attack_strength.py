@@ -11,6 +11,7 @@ Nothing is driven.
 
 import argparse
 import json
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -94,7 +95,8 @@ def main() -> None:
         "recordings": args.recordings.parent.name,
         "controller": args.controller,
         "figures": args.figures,
-        "rungs": [asdict(rung) for rung in rungs],
+        # A rung that needs nothing says so by −∞, which JSON has not.
+        "rungs": [{name: each for name, each in asdict(rung).items() if each != -math.inf} for rung in rungs],
         "random_patterns": args.random_patterns if steering else 0,
         "runs": runs,
         "spread": {
