@@ -15,13 +15,12 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from harden import CROSSINGS, JUDGE_ON, TRAIN_ON, in_words, streets
 from roadproof.cli.progress import stages
+from roadproof.controllers.loading import files_digest
 from roadproof.errors import CanvasNotReachedError
 from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
-from roadproof.hardening.judgement import JudgedAttack, StreetJudge
+from roadproof.hardening.judgement import JudgedAttack, StreetJudge, most_out_of, strongest_of
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.io.files import write_json
 from roadproof.io.records import plain
@@ -29,7 +28,6 @@ from roadproof.machine import keep_freed_memory, made_with
 from roadproof.scenarios import find_scenario, load_scenarios
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
-from roadproof.study.plan import weights_digest
 
 
 def main() -> None:
@@ -55,7 +53,7 @@ def main() -> None:
         seed=given.seed,
         device="cpu",
     )
-    weights = weights_digest(given.controller)
+    weights = files_digest(given.controller)
     keep_freed_memory()
     judged: list[JudgedAttack] = []
     unjudged: dict[str, str] = {}
@@ -84,10 +82,9 @@ def table(judged: list[JudgedAttack]) -> str:
     """What each kind of attack did, and the strongest on each street, as Markdown."""
     kinds = {each.kind: [one for one in judged if one.kind == each.kind] for each in judged}
     on_street = {each.scenario: [one for one in judged if one.scenario == each.scenario] for each in judged}
-    strongest = [max(each, key=lambda one: one.mean_m) for each in on_street.values()]
+    strongest = [strongest_of(each) for each in on_street.values()]
     rows = [f"| {kind} | {in_words(each)} |" for kind, each in {**kinds, "strongest on each street": strongest}.items()]
-    # As the verdict of a hardening counts it: the attack that leads most drives out of their lane, street by street.
-    left = [out for each in on_street.values() for out in max((one.left_lane for one in each), key=np.mean)]
+    left = [out for each in on_street.values() for out in most_out_of(each)]
     head = ["| kind of attack | median (range) | leaves its lane |", "|---|---|---|"]
     told = f"Leaves its lane in {sum(left)} of {len(left)} drives."
     if lost := sum(each.left_out for each in judged):

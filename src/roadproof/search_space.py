@@ -150,6 +150,16 @@ class SearchSpace:
         self.limits.check(known, albedo=self.albedo, black=not self.colour)
         return replace(self, site=known)
 
+    def require_paint(self, site: Site) -> None:
+        """See that the limits leave patterns on a stretch of road whose asphalt is not measured yet.
+
+        Raises:
+            PatternError: as `on` does.
+        """
+        if self.limits is not None:
+            known = self.limits.site(site)
+            self.limits.check(known, albedo=self.albedo, black=not self.colour, measured=False)
+
     @property
     def is_limited(self) -> bool:
         """Whether area or paint is limited, so that a pattern may be another than that of the point's parameters."""

@@ -20,10 +20,11 @@ from roadproof.controllers.cards import ControllerCard
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.precision import lay_out
 from roadproof.controllers.protocol import Controller, missing_members
-from roadproof.controllers.shipped import shipped_weights
+from roadproof.controllers.shipped import installed_weights, shipped_names, shipped_weights
 from roadproof.controllers.weights_file import ARCHITECTURES, card_beside, existing, fill_from, from_weights, tensors_of
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
+from roadproof.io.identity import digest
 
 DTYPES = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
@@ -154,6 +155,13 @@ def files_of(spec: str) -> tuple[Path, ...]:
             with suppress(ControllerError):
                 named += external_data_of(path)
     return tuple(path for path in named if path.is_file())
+
+
+def files_digest(spec: str) -> str:
+    """The digest of a controller's files: weights, and the module that a function is written in; empty without any."""
+    shipped = installed_weights(spec) if spec in shipped_names() else None
+    contents = [file.read_bytes() for file in (files_of(spec) if shipped is None else (shipped,))]
+    return digest(*contents)[:16] if contents else ""
 
 
 PICKLES = (".pt", ".pth", ".ckpt", ".pkl", ".ts", ".torchscript", ".jit")

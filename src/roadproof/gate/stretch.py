@@ -66,9 +66,9 @@ def known_paints(plan: CheckPlan, scenario: Scenario, site: Site, folder: Path) 
     space = SearchSpace(figures=plan.figures, limits=plan.paint)
     if plan.random:
         space = space.on(site)
-    elif plan.paint is not None and plan.budget == "full":
+    elif plan.budget == "full":
         # Fresh attacks would find it out once they have recorded.
-        plan.paint.check(plan.paint.site(site), albedo=space.albedo, black=False, measured=False)
+        space.require_paint(site)
     for seed in plan.seeds if plan.random else ():
         drawn = space.drawn(plan.random, seed)
         for k in range(plan.random):

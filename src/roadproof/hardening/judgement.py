@@ -224,15 +224,24 @@ class Judgement:
         )
 
     def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
-        return max(self._tried(scenario, after=after), key=lambda each: each.mean_m)
+        return strongest_of(self._tried(scenario, after=after))
 
     def _left_lane(self, scenarios: Sequence[str], *, after: bool) -> float:
         """The share of drives that leave the lane, over the attack on each street that leads most of them out of it."""
-        tried = ([each.left_lane for each in self._tried(name, after=after)] for name in scenarios)
-        return float(np.mean([left for kinds in tried for left in max(kinds, key=np.mean)]))
+        return float(np.mean([left for name in scenarios for left in most_out_of(self._tried(name, after=after))]))
 
     def _tried(self, scenario: str, *, after: bool) -> list[JudgedAttack]:
         return [each for each in self.judged if (each.scenario, each.after) == (scenario, after)]
+
+
+def strongest_of(tried: Sequence[JudgedAttack]) -> JudgedAttack:
+    """Of the attacks on one street the one over which a controller deviates most."""
+    return max(tried, key=lambda each: each.mean_m)
+
+
+def most_out_of(tried: Sequence[JudgedAttack]) -> tuple[bool, ...]:
+    """Whether each drive left its lane over the attack on one street that leads most drives out of it."""
+    return max((each.left_lane for each in tried), key=np.mean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

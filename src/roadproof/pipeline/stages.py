@@ -312,7 +312,6 @@ def check_street(simulator: Simulator, scenario: Scenario, space: SearchSpace, b
         EpisodeError: the range of starts reaches off the road.
     """
     if space.limits is not None:
-        site = space.limits.site(site_at(simulator, scenario))
-        space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
+        space.require_paint(site_at(simulator, scenario))
     if budget.starts:
         require_on_road(budget.start_range, scenario, simulator)

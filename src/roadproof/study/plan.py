@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 from roadproof.attacks import BayesianOptimisation, GradOpt
 from roadproof.compositing import Variation
-from roadproof.controllers.loading import files_of
-from roadproof.controllers.shipped import installed_weights, shipped_names
+from roadproof.controllers.loading import files_digest
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import USUAL_PLAN, StartPlan, require_on_road
 from roadproof.errors import PatternError, RoadproofError, StudyError
@@ -25,7 +24,7 @@ from roadproof.roads.maps import load_map
 from roadproof.roads.marks import site_at
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
-from roadproof.search_space import SearchSpace
+from roadproof.search_space import Family, SearchSpace
 from roadproof.simulators.loading import TOWNS, check_spec
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, family_of, method_plan
 
@@ -197,17 +196,18 @@ class Study(Conditions):
                 raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
         if self.paint is None:
             return
+        families: dict[Family, None] = dict.fromkeys(family_of(method) for method in self.methods)
+        colours = dict.fromkeys(figures != BLACK for figures in self.figures)
+        spaces = [
+            SearchSpace(figures=1, family=family, colour=colour, limits=self.paint)
+            for family, colour in product(families, colours)
+        ]
         for scenario in self.scenarios:
             # The marks of other maps are known when their simulator is open.
             known = site_at(_OwnMaps(), scenario) if self._in_town else replace(site_at(None, scenario), marks=())
-            spaces = {
-                SearchSpace(figures=1, family=family_of(method), colour=figures != BLACK)
-                for method, figures in product(self.methods, self.figures)
-            }
-            for space in sorted(spaces, key=repr):
+            for space in spaces:
                 try:
-                    known_site, black = self.paint.site(known), not space.colour
-                    self.paint.check(known_site, albedo=space.albedo, black=black, measured=False)
+                    space.require_paint(known)
                 except PatternError as error:
                     raise StudyError(f"[paint] on {scenario.name}: {error}") from None
 
@@ -303,11 +303,6 @@ _FIRST_WEIGHTS = {
 
 
 def weights_digest(controller: str) -> str:
-    """The digest of the files that a spec names: weights, and the module that a function is written in.
-
-    It is empty for a controller that comes with the package, with the weights that it had first.
-    """
-    shipped = installed_weights(controller) if controller in shipped_names() else None
-    contents = [file.read_bytes() for file in (files_of(controller) if shipped is None else (shipped,))]
-    found = digest(*contents)[:16] if contents else ""
+    """The digest of a controller's files; empty for one that comes with the package, with the weights it had first."""
+    found = files_digest(controller)
     return "" if found == _FIRST_WEIGHTS.get(controller) else found
