@@ -9,8 +9,8 @@ are left in FOLDER/there, and in FOLDER/nodes a file for every time a job began,
 from __future__ import annotations
 
 import os
-import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -24,22 +24,24 @@ from study_work import counts
 
 
 def on_its_node(job: Job, scratch: Path) -> JobResult:
-    """The first two jobs wait until both nodes are at work; then the one with two figures takes its node down."""
-    nodes = Path(os.environ["NODES"])
-    (nodes / f"{job.key}-{ray.get_runtime_context().get_node_id()}").touch()
-    until = time.monotonic() + 120
-    while len({each.name.split("-")[1] for each in nodes.iterdir()}) < 2 and time.monotonic() < until:
-        time.sleep(0.1)
-    if job.figures == 2 and not (scratch / "died").exists():
-        (scratch / "died").touch()
-        os.kill(os.getppid(), signal.SIGKILL)  # the node's raylet, without which its workers end
-        time.sleep(120)
+    """The job with two figures has its node taken down, and is done when it is begun again."""
+    node, nodes = ray.get_runtime_context().get_node_id(), Path(os.environ["NODES"])
+    (nodes / f"{job.key}-{node}").touch()
+    lost = nodes.parent / "lost"
+    if job.figures == 2 and not lost.exists():
+        lost.write_text(node)
+        time.sleep(400)
     return counts(job, scratch)
 
 
-def stop_after_two(done: int, _job: Job, _result: JobResult) -> None:
-    if done == 2:
-        raise KeyboardInterrupt
+def lose(cluster: Cluster, lost: Path) -> None:
+    """Take down the node that `lost` will name, as soon as it does."""
+    while not lost.exists() or not lost.read_text():
+        time.sleep(0.1)
+    # Killed from here, which began the node: nobody else could wait for it, and a node that is killed but not waited
+    # for still counts as alive to its workers, which then go on.
+    (node,) = (each for each in cluster.worker_nodes if each.node_id == lost.read_text())
+    cluster.remove_node(node, allow_graceful=False)
 
 
 if __name__ == "__main__":
@@ -49,6 +51,14 @@ if __name__ == "__main__":
         cluster.add_node(num_cpus=1)
     told = {"PYTHONPATH": ":".join(sys.path), "TMPDIR": str(folder), "NODES": str(folder / "nodes")}
     ray.init(address=cluster.address, log_to_driver=False, runtime_env={"env_vars": told})
+    loss = threading.Thread(target=lose, args=(cluster, folder / "lost"), daemon=True)
+    loss.start()
+
+    def stop_after_two(done: int, _job: Job, _result: JobResult) -> None:
+        loss.join()
+        if done == 2:
+            raise KeyboardInterrupt
+
     study = load_study(folder / "plan.toml")
     try:
         run_study(study, folder / "there", on_its_node, cluster=cluster.address, on_job=stop_after_two)
