@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from roadproof.datatypes import VehicleState
 from roadproof.simulators.carla_server import blueprints
+from roadproof.simulators.carla_server.labels import OF_ACTORS
 from roadproof.simulators.carla_server.wire import Pose6, Value, token
 from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WIDTH_M
 
 CAR_BOX = ((0.0, 0.0, 0.75), (CAR_LENGTH_M / 2, CAR_WIDTH_M / 2, 0.75))
 WALKER_BOX = ((0.0, 0.0, 0.0), (0.25, 0.25, 0.93))
 WALKER_UP_M = 0.93
-LABELS = {"vehicle": 14, "walker": 12}
 AT_REST = (0.0, 0.0, 0.0, False, False, False, 0)
 
 
@@ -88,7 +88,7 @@ class Actor:
 
     def wire(self, port: int) -> Value:
         """The actor as the client takes it; `port` is where its stream is served."""
-        label = LABELS.get(self.kind)
+        label = OF_ACTORS.get(self.kind)
         return [
             self.id,
             self.parent,

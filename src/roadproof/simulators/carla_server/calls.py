@@ -14,9 +14,10 @@ from msgspec.msgpack import Decoder
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.simulators.carla_server import arguments as sent
 from roadproof.simulators.carla_server import blueprints, wire
-from roadproof.simulators.carla_server.actors import LABELS, Actor
+from roadproof.simulators.carla_server.actors import Actor
 from roadproof.simulators.carla_server.arguments import Signature, read
-from roadproof.simulators.carla_server.pieces import ANY_LABEL, level_boxes, spawn_points
+from roadproof.simulators.carla_server.labels import OF_ACTORS, CarlaLabel
+from roadproof.simulators.carla_server.pieces import level_boxes, spawn_points
 from roadproof.simulators.carla_server.requests import Request
 from roadproof.simulators.carla_server.sensors import check_camera
 from roadproof.simulators.carla_server.wire import DONE, ORIGIN, WORLD_STREAM, Value, granted, refused
@@ -160,8 +161,8 @@ class Calls:
 
     def call_get_all_level_BBs(self, label: sent.Byte) -> Value:  # noqa: N802
         assert self._world.town is not None
-        actors = [actor for actor in self._world.actors.values() if actor.kind in LABELS]
-        boxes = [actor.world_box for actor in actors if label in (LABELS[actor.kind], ANY_LABEL)]
+        actors = [actor for actor in self._world.actors.values() if actor.kind in OF_ACTORS]
+        boxes = [actor.world_box for actor in actors if label in (OF_ACTORS[actor.kind], CarlaLabel.ANY)]
         return level_boxes(self._world.town.scenery, label) + boxes
 
     def call_get_names_of_all_objects(self) -> Value:

@@ -17,6 +17,7 @@ from PIL import Image
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.roads.roadmap import RoadMap
+from roadproof.simulators.carla_server.labels import OF_SOLIDS, CarlaLabel
 from roadproof.simulators.carla_server.wire import Pose6, Value
 from roadproof.simulators.town.scenery import Scenery
 
@@ -24,9 +25,6 @@ SPAWN_EVERY_M, SPAWN_UP_M = 15.0, 0.3
 PIECE_M = 20.0
 STRAIGHT_RAD = 0.02
 TURNS = 4
-ANY_LABEL, TREE_LABEL = 255, 9
-LABELS = {"building": 3, "hedge": 5, "lamp post": 6, "parked car": 14, "guard rail": 28}
-"""CARLA's labels of the town's solids. A hedge stops cars, so it is a fence here; its trees have boxes of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +104,12 @@ def level_boxes(scenery: Scenery, label: int) -> list[Value]:
     """
     trees = [(tree.x_m, tree.y_m, 0.0, tree.height_m / 2, tree.height_m / 2, tree.height_m) for tree in scenery.trees]
     solids = [
-        (LABELS[each.name], (each.pose.x_m, each.pose.y_m, each.pose.yaw_rad, *each.half_m, each.height_m))
+        (OF_SOLIDS[each.name], (each.pose.x_m, each.pose.y_m, each.pose.yaw_rad, *each.half_m, each.height_m))
         for each in scenery.solids
-        if each.name in LABELS
+        if each.name in OF_SOLIDS
     ]
     return [
         [[x, -y, height / 2], [length, width, height / 2], [0.0, -math.degrees(yaw), 0.0]]
-        for own, (x, y, yaw, length, width, height) in [*solids, *((TREE_LABEL, tree) for tree in trees)]
-        if label in (own, ANY_LABEL)
+        for own, (x, y, yaw, length, width, height) in [*solids, *((CarlaLabel.VEGETATION, tree) for tree in trees)]
+        if label in (own, CarlaLabel.ANY)
     ]

@@ -13,26 +13,13 @@ from roadproof.geometry import CameraModel
 from roadproof.simulators.carla_server import limits, wire
 from roadproof.simulators.carla_server.actors import Actor, attached
 from roadproof.simulators.carla_server.blueprints import CAMERAS
+from roadproof.simulators.carla_server.labels import OF_PIXELS
 from roadproof.simulators.carla_server.world import Collision, Town, World
 from roadproof.simulators.town.labels import FAR_M, Label, LabelledPicture
 from roadproof.traffic.agents import Agents
 
 MAX_SIDE_PX = 4096
 MAX_ROLL_DEG = 0.1
-
-CARLA_LABELS = {
-    Label.SKY: 11,
-    Label.ROAD: 1,
-    Label.ROAD_LINE: 24,
-    Label.SIDEWALK: 2,
-    Label.TERRAIN: 10,
-    Label.BUILDING: 3,
-    Label.FURNITURE: 20,
-    Label.VEGETATION: 9,
-    Label.VEHICLE: 14,
-    Label.PEDESTRIAN: 12,
-}
-"""CARLA's numbers since 0.9.14."""
 
 
 def check_camera(world: World, sensor: Actor) -> None:
@@ -107,7 +94,7 @@ def depth_levels(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"
 
 def label_levels(labels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Kinds of things as CARLA's semantic camera sends them: its number in red."""
-    numbers = np.array([CARLA_LABELS[label] for label in Label], np.uint8)[labels]
+    numbers = np.array([OF_PIXELS[label] for label in Label], np.uint8)[labels]
     return np.stack([numbers, np.zeros_like(numbers), np.zeros_like(numbers)], axis=-1)
 
 
