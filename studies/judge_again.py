@@ -1,7 +1,7 @@
-"""Does a hardened controller withstand attacks of another seed, and on streets of another town?
+"""Does a hardened controller withstand attacks of another seed, of a larger budget, and on streets of another town?
 
     python studies/judge_again.py --controller CONTROLLER --seed N --json OUT --keep FOLDER
-        [--scenarios studies/scenarios/second-town.toml] [--streets right-11]
+        [--budget full] [--scenarios studies/scenarios/second-town.toml] [--streets right-11]
 
 Each of the twelve streets that `studies/harden.py` judges on, or of any others that it does not train on, is attacked
 afresh with the searches of its judging: by gradient, by a black box and with ellipses. With the seed of a hardening
@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, required=True, help="folder that keeps everything")
     parser.add_argument("--controller", required=True, help="controller that is judged")
     parser.add_argument("--seed", type=int, required=True, help="seed of the searches and of the starts")
+    parser.add_argument("--budget", choices=HARDENING_BUDGETS, default="quick", help="of the judging; default quick")
     parser.add_argument("--scenarios", type=Path, help="TOML file of scenarios; by default the built-in ones")
     parser.add_argument("--streets", nargs="+", help="names; by default all of the file, or harden.py's held-out ones")
     given = parser.parse_args()
@@ -48,7 +49,7 @@ def main() -> None:
         spec=given.controller,
         scenarios=tuple(learnt),
         folder=given.keep,
-        budget=HARDENING_BUDGETS["quick"],
+        budget=HARDENING_BUDGETS[given.budget],
         space=SearchSpace(figures=5),
         seed=given.seed,
         device="cpu",
@@ -69,6 +70,7 @@ def main() -> None:
         "controller": given.controller,
         "weights": weights,
         "seed": given.seed,
+        "budget": given.budget,
         "judged": plain(rows),
         "unjudged": unjudged,
     }

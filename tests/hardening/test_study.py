@@ -10,7 +10,7 @@ import pytest
 
 import needs
 from roadproof.errors import CanvasNotReachedError, TrainingError
-from roadproof.hardening.budget import check_streets
+from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
 from roadproof.hardening.judgement import StreetJudge
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import load_scenarios
@@ -86,13 +86,14 @@ def test_the_study_of_other_seeds_counts_the_attack_that_leads_most_drives_out(j
     often = replace(often, deviation_m=(0.9, 0.9), left_lane=(True, True), left_out=1)
 
     def judge(self):
+        assert self.plan.budget is HARDENING_BUDGETS["full"]
         if self.scenario.name == "left-05":
             raise CanvasNotReachedError("it stops before the canvas")
         return [far, often]
 
     monkeypatch.setattr(StreetJudge, "judge", judge)
-    found = judge_again("--streets", "left-03", "left-05", "--seed", "3")
-    assert (found["controller"], found["seed"]) == ("pilotnet", 3)
+    found = judge_again("--streets", "left-03", "left-05", "--seed", "3", "--budget", "full")
+    assert (found["controller"], found["seed"], found["budget"]) == ("pilotnet", 3, "full")
     assert found["unjudged"] == {"left-05": "it stops before the canvas"}
     assert [each["kind"] for each in found["judged"]] == ["by gradient", "random"]
     assert all("after" not in each for each in found["judged"])
