@@ -15,7 +15,6 @@ transfer.parquet            the patterns driven by other controllers (`study.tra
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -26,7 +25,8 @@ import msgspec
 
 from roadproof.errors import StudyError
 from roadproof.foreign import in_one_line
-from roadproof.io.files import check_closed, remove, write_atomically, write_text
+from roadproof.io.files import check_closed, remove, write_atomically, write_json
+from roadproof.io.records import plain
 from roadproof.io.text import read_json
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobId, JobResult, Row
@@ -48,8 +48,8 @@ def write_result(job: Job, result: JobResult, folder: Path) -> None:
         if Path(name).name != name or name in ("rows.json", "job.json"):
             raise StudyError(f"a job gave a file {name!r}, expected a plain name of its own")
         write_atomically(place / name, lambda part, content=content: part.write_bytes(content))
-    _write_json(place / "job.json", asdict(job))
-    _write_json(place / "rows.json", {"format": ROWS[0], "version": ROWS[1], "rows": result.rows})
+    write_json(place / "job.json", {name: plain(value) for name, value in asdict(job).items()})
+    write_json(place / "rows.json", {"format": ROWS[0], "version": ROWS[1], "rows": result.rows})
 
 
 def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:
@@ -87,7 +87,7 @@ def write_study(study: Study, jobs: Iterable[Job], folder: Path) -> None:
     """
     asked = [named(job) for job in jobs]
     content = {"format": STUDY[0], "version": STUDY[1], "reference": study.reference, "jobs": asked}
-    _write_json(folder / "study.json", content)
+    write_json(folder / "study.json", content)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -183,7 +183,3 @@ def pandas() -> Any:  # noqa: ANN401  # the module
         return import_module("pandas")
     except ImportError as error:
         raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
-
-
-def _write_json(path: Path, content: object) -> None:
-    write_text(path, json.dumps(content, indent=1, default=str, allow_nan=False) + "\n")
