@@ -3,7 +3,7 @@
     python studies/harden.py --json OUT --keep FOLDER [--controller cil] [--budget full] [--steps 1500] [--rounds 2]
         [--processes N]
 
-A controller is hardened on twenty streets, thirteen of the built-in scenarios and seven crossings, and judged on twelve
+A controller is hardened on 26 streets, thirteen of the built-in scenarios and thirteen crossings, and judged on twelve
 other built-in scenarios, four of each kind, on other streets: attacked afresh as in training, by a black box and with
 ellipses, and driven over what was found against it before. Then all forty scenarios are driven over the bare road,
 before and after, in the paper's four weathers. That is `roadproof harden` with these lists; the tables of its page are

@@ -47,7 +47,7 @@ def test_the_streets_of_the_study_lie_apart_and_its_crossings_are_painted_inside
     study = runpy.run_path(str(STUDY))
     crossings = load_scenarios(study["CROSSINGS"])
     training, judging = [*study["streets"](study["TRAIN_ON"]), *crossings], study["streets"](study["JUDGE_ON"])
-    assert (len(training), len(judging)) == (20, 12)
+    assert (len(training), len(judging)) == (26, 12)
     check_streets(training, judging)
     for scenario in crossings:
         route = scenario_route(scenario, load_map(scenario.map_name))
