@@ -16,7 +16,7 @@ transfer.parquet            the patterns driven by other controllers (`study.tra
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -48,7 +48,7 @@ def write_result(job: Job, result: JobResult, folder: Path) -> None:
         if Path(name).name != name or name in ("rows.json", "job.json"):
             raise StudyError(f"a job gave a file {name!r}, expected a plain name of its own")
         write_atomically(place / name, lambda part, content=content: part.write_bytes(content))
-    write_json(place / "job.json", {name: plain(value) for name, value in asdict(job).items()})
+    write_json(place / "job.json", cast("dict[str, Any]", plain(job)))
     write_json(place / "rows.json", {"format": ROWS[0], "version": ROWS[1], "rows": result.rows})
 
 
