@@ -102,7 +102,7 @@ class _Conditions:
 
 
 def collect(
-    plan: CollectionPlan, folder: Path, *, processes: int = 1, on_drive: Callable[[int], object] | None = None
+    plan: CollectionPlan, folder: Path, *, processes: int = 1, on_drive: Callable[[int], object] = lambda _done: None
 ) -> tuple[Path, ...]:
     """Record the drives of a plan that the folder does not hold yet.
 
@@ -125,8 +125,7 @@ def collect(
     done = plan.drives - len(missing)
     for _ in spread(_record, missing, partial(driving, plan.controller, STEP_S), processes=processes):
         done += 1
-        if on_drive is not None:
-            on_drive(done)
+        on_drive(done)
     return paths
 
 

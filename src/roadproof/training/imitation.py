@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from pickle import UnpicklingError  # what torch raises for a file that holds more than numbers
 from typing import Any
@@ -46,6 +46,11 @@ PATH_COUNTS = 3.0
 """A point that is off by a hundredth of its distance changes steering by about three hundredths."""
 
 WEIGHT_DECAY = 1e-2
+WARM_UP = 0.04
+"""Share of the steps over which the learning rate rises."""
+AVERAGING = 0.997
+"""Decay of the running average of the weights; the average is what is kept."""
+AUGMENTATION = Augmentation()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,11 +63,8 @@ class TrainingPlan:
         seed: the seed of everything drawn.
         learning_rate: the largest learning rate; it rises over the first steps and then falls along a cosine to almost
             nothing.
-        warm_up: share of the steps over which the learning rate rises, 0 to 1.
-        averaging: decay of the running average of the weights; the average is what is kept.
         dropout: factor on the network's own dropout; short training learns more with less.
         pasted: share of the pictures with coloured rectangles pasted on the road, 0 to 1.
-        augmentation: how the pictures are varied.
 
     Raises:
         TrainingError: a number is not positive, or there is not one batch to see.
@@ -72,17 +74,14 @@ class TrainingPlan:
     batch: int = 128
     seed: int = 0
     learning_rate: float = 1e-3
-    warm_up: float = 0.04
-    averaging: float = 0.997
     dropout: float = 0.4
     pasted: float = 0.0
-    augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
         for name in ("batch", "learning_rate"):
             if not getattr(self, name) > 0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a value above 0")
-        for name in ("averaging", "dropout", "pasted", "warm_up"):
+        for name in ("dropout", "pasted"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a value in [0, 1]")
         if self.steps < 1:
@@ -95,19 +94,10 @@ class TrainingPlan:
 
     def rate(self, step: int) -> float:
         """The learning rate of a step."""
-        rising = max(1.0, self.warm_up * self.steps)
+        rising = max(1.0, WARM_UP * self.steps)
         if step < rising:
             return self.learning_rate * (step + 1) / rising
         return self.learning_rate * (0.005 + 0.995 * 0.5 * (1.0 + math.cos(math.pi * step / self.steps)))
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a training is: the step, of how many, and the mean loss since the last report."""
-
-    step: int
-    steps: int
-    loss: float
 
 
 def imitate(
@@ -118,7 +108,7 @@ def imitate(
     checkpoint: Path | None = None,
     device: str = "cpu",
     every: int = 100,
-    on_progress: Callable[[Progress], object] | None = None,
+    on_progress: Callable[[int, float], object] = lambda _step, _loss: None,
 ) -> Learner:
     """Train a network.
 
@@ -129,7 +119,7 @@ def imitate(
         checkpoint: file to go on from where it is there, and to keep up to date; None keeps none.
         device: "cpu" or "cuda".
         every: how many steps lie between two reports, and between two checkpoints.
-        on_progress: called with every report.
+        on_progress: called with every report: the steps done, and the mean loss since the last one.
 
     Returns:
         The network with the running average of the weights, in eval mode.
@@ -160,18 +150,17 @@ def imitate(
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
         last = torch.multinomial(weights, plan.batch // window, replacement=True, generator=draw)
         batch = data.batch(data.windows(last, window), place)
-        batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw, window=window))
+        batch = batch._replace(frames=AUGMENTATION(paste(batch.frames, draw), draw, window=window))
         losses += _step(network, batch, plan, optimiser, step)
-        _average(average, network, min(plan.averaging, (1 + step) / (10 + step)))
+        _average(average, network, min(AVERAGING, (1 + step) / (10 + step)))
         counted += 1
         if (step + 1) % every == 0 or step + 1 == plan.steps:
             if not losses.isfinite():
                 raise TrainingError(f"the loss is {float(losses)} near step {step}; lower the learning rate")
-            if on_progress is not None:
-                on_progress(Progress(step + 1, plan.steps, float(losses / counted)))
+            on_progress(step + 1, float(losses / counted))
             losses, counted = torch.zeros(()), 0
-        if checkpoint is not None and ((step + 1) % every == 0 or step + 1 == plan.steps):
-            _keep(checkpoint, plan, step + 1, network, average, optimiser)
+            if checkpoint is not None:
+                _keep(checkpoint, plan, step + 1, network, average, optimiser)
     return average
 
 

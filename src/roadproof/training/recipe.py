@@ -225,13 +225,14 @@ def _trained(
     checkpoint = path.with_suffix(".ckpt")
     if not path.exists():
         title = "Learning from the expert" if number == 0 else f"Round {number}, learning"
+        plan = recipe.training_plan(number)
         learnt = imitate(
             start(),
             Dataset.load(shards),
-            recipe.training_plan(number),
+            plan,
             checkpoint=checkpoint,
             device=device,
-            on_progress=lambda at: on_stage(title, at.step, at.steps, f"loss {at.loss:.4f}"),
+            on_progress=lambda step, loss: on_stage(title, step, plan.steps, f"loss {loss:.4f}"),
         )
         save_controller(learnt, path)
     checkpoint.unlink(missing_ok=True)
