@@ -1,8 +1,9 @@
-"""The largest numbers that are taken, wherever they are given: on the command line, in a plan, in a file."""
+"""How large a number may be, wherever it is given: on the command line, in a plan, in a file."""
 
 from __future__ import annotations
 
 from numbers import Integral
+from typing import TypeGuard
 
 from roadproof.errors import RoadproofError
 
@@ -13,7 +14,7 @@ MAX_PROCESSES = 256
 MANY = 1_000_000
 
 
-def is_whole(number: object) -> bool:
+def is_whole(number: object) -> TypeGuard[int]:
     """Whether something is a whole number, of Python or numpy."""
     return not isinstance(number, bool) and isinstance(number, Integral)
 
@@ -24,5 +25,17 @@ def check_seed(seed: object, what: str, error: type[RoadproofError]) -> None:
     Raises:
         error: it is none, or out of its range.
     """
-    if not isinstance(seed, Integral) or not is_whole(seed) or not 0 <= int(seed) <= MAX_SEED:
+    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
         raise error(f"{what} is {seed!r:.40}, expected a whole number from 0 to {MAX_SEED:,}")
+
+
+def check_range(
+    value: int | float, what: str, least: int | float, most: int | float, error: type[RoadproofError]
+) -> None:
+    """See that a number is in its range.
+
+    Raises:
+        error: the number is out of its range.
+    """
+    if not least <= value <= most:
+        raise error(f"{what} is {value}, expected {least} to {most}")

@@ -102,6 +102,18 @@ def test_a_dry_run_counts_traffic_in_the_weathers_that_have_some(study, tmp_path
     assert drives == [alone, alone + 2 * 3, alone + 2 * 3 * 2]
 
 
+def test_a_dry_run_counts_all_looks_of_a_variation(study, tmp_path, monkeypatch):
+    monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda *_, **__: 0.01)
+    text = PLAN.replace('search = "random", calls = 1', 'search = "gradopt"')
+    seconds = []
+    for more in ("", "[variation]\ndraws = 4"):
+        plan = write_plan(tmp_path, text + more)
+        code, printed = study("run", plan, "--dry-run", "--json", "--out", tmp_path / "out")
+        assert code == 0, printed.err
+        seconds.append(answered(printed.out)["seconds"])
+    assert seconds[1] > 2 * seconds[0]
+
+
 def test_a_dry_run_counts_the_evaluation_of_a_search_in_recordings_once(study, tmp_path):
     text = PLAN.replace("count = 1", "count = 3").replace('figures = ["1-b"]', "figures = [1]")
     plan = write_plan(tmp_path, text.replace('search = "random", calls = 1', 'search = "gradopt"'))

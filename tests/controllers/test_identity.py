@@ -5,10 +5,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from torch import nn
 
 from paint_shy import PaintShy
 from roadproof.controllers import load_controller
-from roadproof.controllers.identity import answers_of, identity_of, parts_of
+from roadproof.controllers.identity import answers_of, architecture_of, identity_of, parts_of
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.training.expert import expert
@@ -104,3 +105,26 @@ def test_a_function_of_the_users_is_known_by_its_source_and_what_it_was_given():
 
     assert identity_of(made(1.0), SIZE) == identity_of(made(1.0), SIZE) != identity_of(made(2.0), SIZE)
     assert identity_of(partial(expert, 1), SIZE) != identity_of(partial(expert, 2), SIZE)
+
+
+def test_an_architecture_is_known_by_its_shapes_not_its_weights():
+    one, other = load_controller("pilotnet"), load_controller("pilotnet-b")
+    assert architecture_of(one) == architecture_of(other) != architecture_of(load_controller("cil-small"))
+    assert architecture_of(load_controller("cil-small")) != architecture_of(load_controller("cil"))
+
+
+def test_an_architecture_is_known_by_its_layers_also_within_a_class_that_is_no_module():
+    class Mine(PaintShy):
+        def __init__(self, network):
+            super().__init__()
+            self.network = network
+
+    def net(activation):
+        return nn.Sequential(nn.Flatten(), nn.Linear(12, 4), activation, nn.Linear(4, 1))
+
+    one, again, other = (architecture_of(Mine(net(layer))) for layer in (nn.ReLU(), nn.ReLU(), nn.Tanh()))
+    assert one == again != other
+    held = [architecture_of(Mine([{"one": net(layer)}])) for layer in (nn.ReLU(), nn.Tanh())]
+    assert held[0] != held[1]
+    assert architecture_of(Mine(load_controller("pilotnet"))) != architecture_of(Mine(load_controller("waypoint")))
+    assert architecture_of(Mine(None)).endswith("Mine")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import nn
 
 import needs
 import roadproof
@@ -19,7 +18,7 @@ from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import CanvasNotReachedError, CheckError, PatternError, RecordingError
-from roadproof.gate.check import architecture_of, run_check
+from roadproof.gate.check import run_check
 from roadproof.gate.places import places_of
 from roadproof.gate.plan import load_check
 from roadproof.gate.result import CHECK_FILE
@@ -172,6 +171,20 @@ def full_plan(team):
     plan = plan.replace("stored = { deviation_m = 0.2, left_lane = 0.0 }", "fresh = { deviation_m = 0.5 }")
     (team / "full.toml").write_text(plan)
     return load_check(team / "full.toml", budget="full", trust=True)
+
+
+def test_the_estimate_counts_all_looks_of_a_variation(team, tmp_path, invoke, monkeypatch):
+    monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda *_, **__: 0.01)
+    monkeypatch.chdir(team)
+    full_plan(team)
+    seconds = []
+    for more in ("", "[variation]\ndraws = 4\n"):
+        (team / "varied.toml").write_text((team / "full.toml").read_text() + more)
+        asked = ("check", "varied.toml", "--budget", "full", "--trust", "--out", tmp_path, "--dry-run", "--json")
+        code, said = invoke(*map(str, asked))
+        assert code == 0, said.err
+        seconds.append(json.loads(said.out)["seconds"])
+    assert seconds[1] > 2 * seconds[0]
 
 
 def test_a_full_check_of_who_does_not_drive_well_fails_and_attacks_nothing(team, tmp_path):
@@ -365,29 +378,6 @@ def test_a_fresh_attack_in_another_weather_is_another_condition(team, tmp_path):
     assert not set(noon_first) & set(rain_first)
     assert known(noon) == noon_first
     assert known(noon, rain, kind=Kind.RANDOM) == known(rain, noon, kind=Kind.RANDOM)
-
-
-def test_an_architecture_is_known_by_its_shapes_not_its_weights():
-    one, other = load_controller("pilotnet"), load_controller("pilotnet-b")
-    assert architecture_of(one) == architecture_of(other) != architecture_of(load_controller("cil-small"))
-    assert architecture_of(load_controller("cil-small")) != architecture_of(load_controller("cil"))
-
-
-def test_an_architecture_is_known_by_its_layers_also_within_a_class_that_is_no_module():
-    class Mine(MagentaShy):
-        def __init__(self, network):
-            super().__init__()
-            self.network = network
-
-    def net(activation):
-        return nn.Sequential(nn.Flatten(), nn.Linear(12, 4), activation, nn.Linear(4, 1))
-
-    one, again, other = (architecture_of(Mine(net(layer))) for layer in (nn.ReLU(), nn.ReLU(), nn.Tanh()))
-    assert one == again != other
-    held = [architecture_of(Mine([{"one": net(layer)}])) for layer in (nn.ReLU(), nn.Tanh())]
-    assert held[0] != held[1]
-    assert architecture_of(Mine(load_controller("pilotnet"))) != architecture_of(Mine(load_controller("waypoint")))
-    assert architecture_of(Mine(None)).endswith("Mine")
 
 
 def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypatch):

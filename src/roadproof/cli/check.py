@@ -41,8 +41,7 @@ def check(
     from roadproof.controllers import load_controller
     from roadproof.errors import CheckError
     from roadproof.gate.check import clear, run_check
-    from roadproof.gate.plan import BUDGETS, load_check, references_of
-    from roadproof.gate.result import FILE
+    from roadproof.gate.plan import BUDGETS, FILE, load_check, references_of
     from roadproof.gate.verdict import Status
     from roadproof.io.files import check_writable
     from roadproof.io.locks import hold
@@ -77,7 +76,6 @@ def check(
 
 def _workload(plan: CheckPlan, who: Controller, processes: int) -> Workload:
     """All cases; a fresh attack is a whole stress test but for its evaluation."""
-    from roadproof.pipeline.budget import QUICK
     from roadproof.pipeline.workload import of_drives, of_run
 
     seeds, full = len(plan.seeds), plan.budget == "full"
@@ -87,8 +85,7 @@ def _workload(plan: CheckPlan, who: Controller, processes: int) -> Workload:
     driven = of_drives(drives, processes=processes)
     if not full:
         return replace(driven, drives=0)
-    attack = replace(QUICK, weathers=plan.weathers[:1], starts=0)
-    return of_run(attack, who, film=False).times(len(plan.scenarios) * seeds) + driven
+    return of_run(plan.attack, who, film=False).times(len(plan.scenarios) * seeds) + driven
 
 
 def _summarise(result: CheckResult, out: Path) -> None:

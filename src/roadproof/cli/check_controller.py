@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +13,8 @@ from roadproof.cli.options import argument
 from roadproof.cli.output import answer, say
 
 if TYPE_CHECKING:
+    from roadproof.datatypes import Weather
+    from roadproof.scenarios import Scenario
     from roadproof.training.scores import BareDrive, DrivingScore
 
 
@@ -25,7 +28,6 @@ def check_controller(
     drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
 ) -> None:
     """Check what attacks rely on, then drive every scenario and count those without any event."""
-    from roadproof.cli.progress import progress
     from roadproof.controllers import check_controller as check
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import DRIVES
@@ -37,15 +39,23 @@ def check_controller(
     acts = any(check.name == DRIVES and check.passed for check in report.checks)
     if drive and not acts:
         typer.echo("not driven: act does not answer as a drive needs it", err=True)
-    found = {"controller": spec, "passed": report.passed, "checks": report.checks, "drives": None}
-    if not drive or not acts:
-        answer(found)
-        raise typer.Exit(0 if report.passed else 1)
+    found: dict[str, Any] = {"controller": spec, "passed": report.passed, "checks": report.checks, "drives": None}
+    if drive and acts:
+        found["drives"] = _driven(spec, driven, sky, cars, pedestrians, processes)
+    answer(found)
+    if not report.passed:
+        raise typer.Exit(1)
 
+
+def _driven(
+    spec: str, scenarios: Sequence[Scenario], sky: Weather, cars: int, pedestrians: int, processes: int
+) -> list[dict[str, Any]]:
+    """Drive, say how it went, and tell what came of each scenario."""
     # Panda3D is an extra.
+    from roadproof.cli.progress import progress
     from roadproof.training.scores import BareDrive, score_drives
 
-    wanted = [BareDrive(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in driven]
+    wanted = [BareDrive(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in scenarios]
     scored: list[tuple[BareDrive, DrivingScore]] = []
     with progress("Driving", len(wanted), "{:.0f} clean") as show:
         for done in score_drives(wanted, spec, processes=processes):
@@ -54,9 +64,7 @@ def check_controller(
     scored.sort(key=lambda pair: pair[0].scenario.name)
     _say_scores(scored)
     told = {"weather": sky, "cars": cars, "pedestrians": pedestrians}
-    drives = [{"scenario": each.scenario.name, **told, "clean": s.clean, **asdict(s)} for each, s in scored]
-    answer(found | {"drives": drives})
-    raise typer.Exit(0 if report.passed else 1)
+    return [{"scenario": each.scenario.name, **told, "clean": s.clean, **asdict(s)} for each, s in scored]
 
 
 def _say_scores(scored: list[tuple[BareDrive, DrivingScore]]) -> None:

@@ -72,7 +72,7 @@ def weather_names(begun: str) -> list[str]:
 
 
 def argument(about: str) -> Any:  # noqa: ANN401
-    """An argument that must be given."""
+    """An argument, in words; it must be given where its type has no default."""
     return typer.Argument(help=about, show_default=False)
 
 

@@ -81,7 +81,7 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
     own, recordings = Workload(), dict[str, Workload]()
     for method in study.methods:
         own += judging
-        budget = budget_of(method, study.weathers[0])
+        budget = budget_of(method, study.weathers[0], study.variation)
         if isinstance(method, BlackBoxPlan) and method.where == "simulator":
             own += of_drives(method.calls + 1) + of_proposals(budget.method)
         else:

@@ -6,11 +6,14 @@ source. Drives, recordings and runs that were made with the one are not taken fo
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from itertools import product
-from typing import TypedDict
+from typing import Any, TypedDict, cast
 
 import numpy as np
 from jaxtyping import UInt8
+from torch import nn
 
 from roadproof.controllers.asking import frame_size_of, next_act_of
 from roadproof.controllers.protocol import Controller
@@ -80,6 +83,21 @@ def told_of(driver: object, size: tuple[int, int]) -> tuple[Answers, str]:
     return first, digest(stated([known_by(driver), steady, first, asked]))[:16]
 
 
+def architecture_of(controller: Controller) -> str:
+    """What a controller is made of, whatever it has learnt: its type, and a hash of its layers and tensors' shapes.
+
+    Of one that is no module, the modules count that its attributes are or hold.
+    """
+    name = type(controller).__qualname__
+    kept = [controller] if isinstance(controller, nn.Module) else _modules_in(getattr(controller, "__dict__", {}))
+    if not kept:
+        return name
+    layers = [type(layer).__qualname__ for module in kept for layer in module.modules()]
+    states = [(path, value) for module in kept for path, value in module.state_dict().items()]
+    shapes = [(path, list(getattr(value, "shape", ()))) for path, value in states]
+    return f"{name}-{digest(json.dumps([layers, shapes]))[:8]}"
+
+
 class Parts(TypedDict):
     """The parts by which a folder knows a driver: `io.identity.ANSWERS` and `CONTROLLER`."""
 
@@ -91,6 +109,18 @@ def parts_of(driver: object, size: tuple[int, int]) -> Parts:
     """The parts by which a folder knows a driver, by name; arguments and errors are those of `identity_of`."""
     answers, which = told_of(driver, size)
     return {"answers": digest(stated(answers))[:16] if answers else "", "controller_digest": which}
+
+
+def _modules_in(value: object) -> list[nn.Module]:
+    """The modules that a value is or holds, in dicts, lists and tuples within each other."""
+    if isinstance(value, nn.Module):
+        return [value]
+    held: Iterable[Any] = ()
+    if isinstance(value, dict):
+        held = cast("dict[Any, Any]", value).values()
+    elif isinstance(value, list | tuple):
+        held = cast("list[Any]", value)
+    return [module for each in held for module in _modules_in(each)]
 
 
 def _answers_to_all(controller: Controller, size: tuple[int, int]) -> list[tuple[float, ...] | None]:

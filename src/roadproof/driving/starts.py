@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from roadproof.errors import EpisodeError
-from roadproof.io.tables import check_range
-from roadproof.limits import check_seed
+from roadproof.limits import check_range, check_seed
 from roadproof.roads.maps import Mapped
 from roadproof.roads.roadmap import ON_ROAD
 from roadproof.scenarios import Scenario

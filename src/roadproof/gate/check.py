@@ -12,36 +12,29 @@ None of the first four is there before all cases are judged.
 
 from __future__ import annotations
 
-import json
 import re
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
-
-from torch import nn
 
 import roadproof
 from roadproof.attacks import site_of
-from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
-from roadproof.controllers.identity import identity_of
+from roadproof.controllers.identity import architecture_of, identity_of
 from roadproof.driving.drive_store import Episodes, load_episodes
 from roadproof.driving.starts import NOMINAL, require_on_road
 from roadproof.errors import CanvasNotReachedError, CheckError
 from roadproof.gate.outputs import WORST, WORST_COLUMNS, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
-from roadproof.gate.plan import CheckPlan, Key, fresh
-from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
+from roadproof.gate.plan import FILE, CheckPlan, Key, fresh
+from roadproof.gate.result import AGAIN, Case, CheckResult, JudgedDrive, load_reference, worst_of
 from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
-from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.film import STRIP, STRIP_SIZE, Strip, film_drives, forget_film, pictures_at
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
@@ -52,9 +45,9 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, begun_in
 
-SUMMARY = "summary.md"
+JUNIT, SUMMARY = "junit.xml", "summary.md"
 PATTERNS, DRIVES = "patterns", "drives"
-OUTPUTS = (FILE, "junit.xml", SUMMARY, WORST)
+OUTPUTS = (FILE, JUNIT, SUMMARY, WORST)
 
 
 def run_check(
@@ -111,7 +104,7 @@ def run_check(
             cases=cases,
         )
         pictured = run.film(places, cases)
-        write_junit(result, time.perf_counter() - begun, folder / "junit.xml")
+        write_junit(result, time.perf_counter() - begun, folder / JUNIT)
         write_summary(result, pictured, folder / SUMMARY)
         result.save(folder / FILE)
     return result
@@ -157,36 +150,9 @@ def _keep_apart(folder: Path, plan: CheckPlan) -> None:
             raise CheckError(f"the results would lie among the plan's patterns in {place}; choose another folder")
 
 
-def architecture_of(controller: Controller) -> str:
-    """What a controller is made of, whatever it has learnt: its type, and a hash of its layers and tensors' shapes.
-
-    Of one that is no module, the modules count that its attributes are or hold.
-    """
-    name = type(controller).__qualname__
-    kept = [controller] if isinstance(controller, nn.Module) else _modules_in(getattr(controller, "__dict__", {}))
-    if not kept:
-        return name
-    layers = [type(layer).__qualname__ for module in kept for layer in module.modules()]
-    states = [(path, value) for module in kept for path, value in module.state_dict().items()]
-    shapes = [(path, list(getattr(value, "shape", ()))) for path, value in states]
-    return f"{name}-{digest(json.dumps([layers, shapes]))[:8]}"
-
-
-def _modules_in(value: object) -> list[nn.Module]:
-    """The modules that a value is or holds, in dicts, lists and tuples within each other."""
-    if isinstance(value, nn.Module):
-        return [value]
-    held: Iterable[Any] = ()
-    if isinstance(value, dict):
-        held = cast("dict[Any, Any]", value).values()
-    elif isinstance(value, list | tuple):
-        held = cast("list[Any]", value)
-    return [module for each in held for module in _modules_in(each)]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Check:
-    """The arguments of `run_check`."""
+    """A check that is under way: the arguments of `run_check`, and the cases of the reference by their keys."""
 
     plan: CheckPlan
     controller: Controller
@@ -209,7 +175,7 @@ class _Check:
                 if stored is not None and stored.conditions != conditions:
                     raise CheckError(
                         f"the reference {self.plan.reference} has {stored} with other patterns, starts, seeds or "
-                        "recordings; make it again with --accept, from a controller that you trust"
+                        f"recordings; {AGAIN}"
                     )
 
     def cases(self, place: Place) -> list[Case]:
@@ -310,10 +276,7 @@ class _Check:
             self.controller,
             scenario,
             self.folder / "fresh" / f"{scenario.name}-{seed}-{who[:8]}",
-            # Its own evaluation is one drive; the cases' drives judge it.
-            budget=replace(
-                QUICK, weathers=plan.weathers[:1], starts=0, objective=varied(QUICK.objective, plan.variation)
-            ),
+            budget=plan.attack,
             space=SearchSpace(figures=plan.figures, limits=plan.paint),
             seed=seed,
             controller_name=plan.controller,

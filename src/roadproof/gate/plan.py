@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast, get_args
 
+from roadproof.attacks.objective import varied
 from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartPlan
@@ -14,10 +15,11 @@ from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.tables import build, check_range, each_once
+from roadproof.io.tables import build, each_once
 from roadproof.io.text import read_toml
-from roadproof.limits import MAX_FIGURES, check_seed
+from roadproof.limits import MAX_FIGURES, check_range, check_seed
 from roadproof.paint import PaintLimits
+from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.scenarios import BUILTIN_FILE, Scenario, load_scenarios
 from roadproof.simulators.loading import check_spec
@@ -26,6 +28,7 @@ Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
 
 BARE, RANDOM = "bare road", "random patterns"
+FILE = "check.json"
 FORMAT = "roadproof-check"
 FORMAT_VERSION = 1
 BudgetName = Literal["smoke", "full"]
@@ -96,6 +99,12 @@ class CheckPlan:
                 (scenario.name, weather, *each) for weather in self.weathers for each in ((Kind.BARE, BARE), *painted)
             ]
         return tuple(found)
+
+    @property
+    def attack(self) -> Budget:
+        """What a fresh attack spends; its own evaluation is one drive, for the cases' drives judge it."""
+        objective = varied(QUICK.objective, self.variation)
+        return replace(QUICK, weathers=self.weathers[:1], starts=0, objective=objective)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -211,7 +220,7 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         simulator=full.simulator,
         limits=_limits(stated.limits),
         change=change,
-        reference=reference and reference / chosen / "check.json",
+        reference=reference and reference / chosen / FILE,
     )
     _check_drives(plan)
     _check_asphalt(plan)

@@ -16,8 +16,7 @@ from roadproof.gate.verdict import Kind, Status
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import RecordFile
 
-FILE = "check.json"
-_AGAIN = "make it again with --accept, from a controller that you trust"
+AGAIN = "make it again with --accept, from a controller that you trust"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -134,7 +133,7 @@ class CheckResult:
         )
 
 
-CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=_AGAIN)
+CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=AGAIN)
 
 
 def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, Case]:
@@ -159,10 +158,10 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     )
     for what, before, now in told:
         if before != now:
-            raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {_AGAIN}")
+            raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {AGAIN}")
     if not stored.cases or stored.not_passed:
         why = f"{stored.not_passed[0]}: {stored.not_passed[0].status}" if stored.cases else "it has no case"
-        raise CheckError(f"the reference {path} did not pass ({why}), so nothing is measured by it; {_AGAIN}")
+        raise CheckError(f"the reference {path} did not pass ({why}), so nothing is measured by it; {AGAIN}")
     if left_out := [case for case in stored.cases if case.key not in plan.keys]:
-        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {_AGAIN}")
+        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {AGAIN}")
     return {case.key: case for case in stored.cases}

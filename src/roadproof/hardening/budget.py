@@ -39,7 +39,8 @@ class HardeningBudget:
         clean_weathers: the weathers in which drives over the bare road are counted.
 
     Raises:
-        TrainingError: the judging attack does not drive in the recorded world, or drives nothing.
+        TrainingError: an attack does not drive in the recorded world, a number of drives is below 0, or no weather is
+            given for drives over the bare road.
     """
 
     attack: Budget = field(default_factory=lambda: replace(ALONE, method=GradOpt(restarts=1)))
@@ -60,9 +61,7 @@ class HardeningBudget:
             )
 
     def varied(self, variation: Variation | None) -> HardeningBudget:
-        """The same budget with all searches in expectation over a variation; this budget itself where there is none."""
-        if variation is None:
-            return self
+        """The same budget with all searches in expectation over a variation."""
         attack, judge = (
             replace(each, objective=varied(each.objective, variation)) for each in (self.attack, self.judge)
         )

@@ -165,18 +165,12 @@ class HardeningStages:
         """Drive over the bare road with the controllers before and after."""
         scenarios = list(dict.fromkeys(scenarios))  # no two processes drive into one folder
         with self.ledger.stage("bare road"):
-            for number, when in ((0, "before"), (best, "after")):
-                self._together(f"Bare road, {when}", _drive_clean, number, scenarios)
-            before, after = (
-                _drive_over(
-                    self.plan,
-                    number,
-                    self.simulator,
-                    scenarios,
-                    lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
-                )
-                for number, when in ((0, "before"), (best, "after"))
-            )
+            driven: list[BareDrives] = []
+            for number, title in ((0, "Bare road, before"), (best, "Bare road, after")):
+                self._together(title, _drive_clean, number, scenarios)
+                told = partial(self.tell, title, word="drives")
+                driven.append(_drive_over(self.plan, number, self.simulator, scenarios, told))
+            before, after = driven
             self.ledger.calls("bare road", before.drives + after.drives)
         return before, after
 

@@ -130,15 +130,3 @@ def each_once(values: Sequence[object], what: str, error: type[RoadproofError]) 
         raise error(f"{what} is empty, expected at least one")
     if (twice := first_twice(values)) is not None:
         raise error(f"{what} has {twice} twice, expected each once")
-
-
-def check_range(
-    value: int | float, what: str, least: int | float, most: int | float, error: type[RoadproofError]
-) -> None:
-    """See that a number is in its range.
-
-    Raises:
-        error: the number is out of its range.
-    """
-    if not least <= value <= most:
-        raise error(f"{what} is {value}, expected {least} to {most}")

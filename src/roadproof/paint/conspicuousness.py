@@ -103,8 +103,7 @@ def _likeness(
     width = 2 * float(np.linalg.norm(short))
     unit = (ends[:, 1] - ends[:, 0]) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[:, None]
     turned = np.arccos(np.clip(np.abs(unit @ long) / np.linalg.norm(long), 0.0, 1.0))
-    known = [cast("Rgb", tuple(colour.tolist()))] * len(paints)
-    other = np.array([contrast(np.array(rgb_of(paint)), mine) for paint, mine in zip(paints, known, strict=True)])
+    other = contrast(np.array([rgb_of(paint) for paint in paints]), cast("Rgb", tuple(colour.tolist())))
     alike = np.minimum(width, widths) / np.maximum(width, widths)
     alike = alike * np.clip(1 - turned / _OTHER_DIRECTION_RAD, 0, 1) * np.clip(1 - other / _OTHER_COLOUR, 0, 1)
     return float(alike.max())

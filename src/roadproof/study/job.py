@@ -12,7 +12,7 @@ import torch
 from roadproof.attacks import site_of
 from roadproof.attacks.blackbox import blackbox_search
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
-from roadproof.attacks.objective import OBJECTIVES, varied
+from roadproof.attacks.objective import OBJECTIVES
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import path_of
@@ -132,8 +132,8 @@ def space_of(job: Job) -> SearchSpace:
 
 def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Found:
     # Its own evaluation is a part of the study's conditions and kept where those are.
-    budget = replace(budget_of(job.method, job.weathers[0]), starts=job.starts.count, start_range=job.starts.range)
-    budget = replace(budget, objective=varied(budget.objective, job.variation))
+    budget = budget_of(job.method, job.weathers[0], job.variation)
+    budget = replace(budget, starts=job.starts.count, start_range=job.starts.range)
     found, calls, seconds = _searched(job, world, controller, folder, budget)
     strongest = found.attack.history.max((1, 2))
     before = [found.cost[stage] for stage in ("record", "calibrate")]

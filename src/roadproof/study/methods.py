@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal, TypeAlias, cast
 import msgspec
 
 from roadproof.attacks import METHODS, OBJECTIVES, BayesianOptimisation, BlackBox, GradOpt, Published, method_of
+from roadproof.attacks.objective import varied
 from roadproof.calibration import CalibrationMethod
+from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import StudyError
@@ -143,8 +145,8 @@ def method_plan(values: Mapping[str, Any]) -> MethodPlan:
     return build(kind, values, f"method {name}", StudyError)
 
 
-def budget_of(method: MethodPlan, weather: Weather) -> Budget:
-    """What a method spends on finding a pattern in recordings, in one weather.
+def budget_of(method: MethodPlan, weather: Weather, variation: Variation | None = None) -> Budget:
+    """What a method spends on finding a pattern in recordings, in one weather, in expectation over a variation.
 
     Raises:
         RoadproofError: a value of the method is out of its range.
@@ -153,7 +155,7 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
         case GradOptPlan():
             swerve = Swerve(method.swerves_m, method.weaves_m)
             least_px = (QUICK.window if method.objective == "deviation" else Window()).least_px
-            return replace(
+            budget = replace(
                 QUICK,
                 weathers=(weather,),
                 method=GradOpt(iterations=method.iterations, restarts=method.restarts, halving=method.halving),
@@ -163,13 +165,13 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
                 ),
                 window=Window(frames=method.frames, least_px=least_px),
                 pooled=method.scheme != "group",
-                calibration=CalibrationMethod(method.calibration),
+                calibration=method.calibration,
                 select=method.select,
                 rounds=method.rounds,
                 attack_weathers=method.attack_weathers,
             )
         case PublishedPlan():
-            return replace(
+            budget = replace(
                 PUBLISHED,
                 weathers=(weather,),
                 runs=0,
@@ -178,7 +180,10 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
                 pooled=method.scheme != "group",
             )
         case BlackBoxPlan():
-            return replace(QUICK, weathers=(weather,), method=black_box(method), objective=OBJECTIVES[method.objective])
+            budget = replace(
+                QUICK, weathers=(weather,), method=black_box(method), objective=OBJECTIVES[method.objective]
+            )
+    return replace(budget, objective=varied(budget.objective, variation))
 
 
 def black_box(method: BlackBoxPlan) -> BlackBox:

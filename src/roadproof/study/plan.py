@@ -15,9 +15,9 @@ from roadproof.driving.starts import USUAL_PLAN, StartPlan, require_on_road
 from roadproof.errors import PatternError, RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
-from roadproof.io.tables import build, check_range, each_once
+from roadproof.io.tables import build, each_once
 from roadproof.io.text import read_toml
-from roadproof.limits import MAX_CROWD, MAX_FIGURES, check_seed
+from roadproof.limits import MAX_CROWD, MAX_FIGURES, check_range, check_seed
 from roadproof.paint import PaintLimits
 from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.roads.maps import load_map

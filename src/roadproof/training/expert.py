@@ -1,4 +1,4 @@
-"""A driver that sees everything: the route, the other cars, the people. Tests and training drive with it.
+"""A driver that sees everything: the route, the other cars, the people. Training learns from what it would do.
 
 Steering is pure pursuit from the rear axle; speed is the lowest of what is wanted, what bends ahead allow, and what the
 intelligent driver model allows behind whatever stands or moves in the way.

@@ -29,7 +29,8 @@ class Shard(Saved):
         expert: (n, 3) steer, throttle and brake the expert would give there; never what disturbed the drive.
         lateral_m: (n,) offset of the car from the route, metres, left positive.
         path_m: (n, p, 2) points of the route ahead, from near to far, metres ahead of and left of the car's middle.
-        about: scenario, weather, traffic, seed, who drove: for people and statistics.
+        about: plan and number of the drive, by which a folder knows it; weather and traffic; whether it was disturbed
+            or painted.
 
     Raises:
         TrainingError: shapes do not fit each other, or a value is not finite.
