@@ -206,7 +206,7 @@ def main() -> None:
                     spec=spec,
                     controller=load_controller(spec),
                     scenario=find_scenario(name),
-                    folder=asked.keep / spec / name / f"seed-{asked.seed}",
+                    folder=asked.keep / _folder(spec) / name / f"seed-{asked.seed}",
                     seed=asked.seed,
                 )
                 for row in cell.rows(asked.limits):

@@ -197,6 +197,7 @@ def test_a_full_check_of_who_does_not_drive_well_fails_and_attacks_nothing(team,
     ]
     assert not (tmp_path / "fresh").exists()
     assert "not-searched-0.json" in result.cases[1].command
+    assert "on the bare road no drive went well in clear-noon" in result.cases[1].reasons[0]
     assert (tmp_path / "summary.md").exists() and (tmp_path / "junit.xml").exists()
 
 

@@ -304,6 +304,18 @@ def check_result(found, out):
         assert word in page
 
 
+@pytest.mark.parametrize("place", ["", "round-1"])
+def test_weights_that_the_results_would_be_written_over_are_refused_and_kept(town, tmp_path, place):
+    own = tmp_path / place / "hardened.safetensors"
+    own.parent.mkdir(exist_ok=True)
+    save_controller(load_controller("pilotnet"), own)
+    before = own.read_bytes()
+    with pytest.raises(TrainingError, match="keeps its results; choose another folder for them"):
+        harden(town, str(own), [street(tmp_path, "near", 15.0)], tmp_path, rounds=1, budget=TINY)
+    assert own.read_bytes() == before
+    assert not (tmp_path / "run.json").exists()
+
+
 def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
     folder = tmp_path / "out"
     nowhere = dataclasses.replace(street(tmp_path, "far", 115.0), goal_m=(500.0, 500.0))

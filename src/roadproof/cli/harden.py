@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def harden(
-    controller: Annotated[str, argument(f"A torch.nn.Module: {options.CONTROLLERS}")],
+    controller: Annotated[str, argument(f"A torch.nn.Module: {options.TRAINABLE}")],
     train_on: Annotated[str, unset("Scenarios to train on, with commas between.")],
     judge_on: Annotated[str, unset("Scenarios on other streets to judge on, with commas between.")] = "",
     clean_on: Annotated[
@@ -75,7 +76,8 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean), processes), out)
+    asked = spent if simulator == "town" else replace(spent, town_drives=0)
+    begin(_workload(asked, who, rounds, len(training), len(judging), len(clean), processes), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,

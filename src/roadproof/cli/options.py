@@ -108,10 +108,8 @@ def _device(device: str) -> str:
     return str(device_of(device))
 
 
-CONTROLLERS = (
-    "a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
-    "module:factory."
-)
+TRAINABLE = "a shipped one (`roadproof controllers`), a .safetensors file, cil:FILE, pilotnet:FILE or module:factory."
+CONTROLLERS = TRAINABLE.replace(".safetensors file", ".safetensors, .pt2 or .onnx file")
 ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"What is tested: {CONTROLLERS}")]
 DriverSpec: TypeAlias = Annotated[
     str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {CONTROLLERS}")

@@ -81,7 +81,7 @@ def _paint(asked: Mapping[str, Any]) -> Paint:
         said["colours"] = tuple(each.strip() for each in said["colours"].split(","))
     if said:
         limits = replace(limits or PaintLimits(), **said)
-    return Paint(limits, variation or (Variation() if "robust" in given else None))
+    return Paint(limits, Variation() if "robust" in given else variation)
 
 
 def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:

@@ -44,7 +44,7 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
 
     Args:
         spec: one of
-            `cil`, `pilotnet` …: one that comes with roadproof, see `shipped` (`cil` and `cil-small`: extra `cil`);
+            `cil`, `pilotnet` …: one that comes with roadproof, see `shipped` (those of `cil`: extra `cil`);
             `FILE.safetensors`: weights; the card in its header (`save_controller`) or beside it as `FILE.json` says
             of which network;
             `cil:FILE.safetensors`, `pilotnet:FILE.safetensors`: weights without a card, of the published network on

@@ -188,8 +188,9 @@ class _Check:
                 bare = self._stretch(place, world, scenario, ())
                 self._drive(place, bare)
                 drives_well = any(not each.wrong for each in bare.bare(plan.weathers[0]))
+                missing = f"no attack could be made: on the bare road no drive went well in {plan.weathers[0]}"
                 paints += tuple(
-                    self._fresh(world, scenario, seed) if drives_well else self._unsearched(scenario, seed)
+                    self._fresh(world, scenario, seed) if drives_well else self._unsearched(scenario, seed, missing)
                     for seed in plan.seeds
                 )
             stretch = self._stretch(place, world, scenario, paints)
@@ -287,7 +288,7 @@ class _Check:
             ),
         )
 
-    def _unsearched(self, scenario: Scenario, seed: int, why: str = "") -> Paint:
+    def _unsearched(self, scenario: Scenario, seed: int, why: str) -> Paint:
         """Any pattern, to see the bare road beside: no attack begins where the car does not arrive without paint."""
         path = self.folder / PATTERNS / scenario.name / f"not-searched-{seed}.json"
         pattern = SearchSpace(figures=self.plan.figures).drawn(1, seed)[0]

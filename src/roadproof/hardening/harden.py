@@ -21,9 +21,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from pathlib import Path
 
 from roadproof.controllers.checks import require_usable
-from roadproof.controllers.loading import load_trainable
+from roadproof.controllers.loading import files_of, load_trainable
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, by_street, check_streets
 from roadproof.hardening.judgement import Judgement
@@ -108,6 +109,7 @@ def harden(
     for each in dict.fromkeys((*streets, *clean_on)):
         require_route(simulator, each)
     network = load_trainable(controller)
+    _require_others(controller, folder)
     plan = HardeningPlan(
         spec=controller,
         scenarios=tuple(scenarios),
@@ -144,3 +146,11 @@ def harden(
         )
         found.save(folder)
     return found
+
+
+def _require_others(controller: str, folder: Path) -> None:
+    """See that no weights of the user's are written over, or taken for those of a round."""
+    own = {each.resolve() for each in (folder / WEIGHTS, *folder.glob(f"round-*/{WEIGHTS}"))}
+    for path in files_of(controller):
+        if path.resolve() in own:
+            raise TrainingError(f"{path} is where {folder} keeps its results; choose another folder for them")
