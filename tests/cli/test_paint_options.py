@@ -9,6 +9,8 @@ import pytest
 
 from recorded_drives import drivable_set
 from roadproof.attacks import AttackResult
+from roadproof.cli.paint import OPTIONS, with_paint
+from roadproof.compositing import Variation
 from roadproof.paint import LaneMark
 from roadproof.recordings import save_recordings
 
@@ -85,6 +87,12 @@ def test_limits_of_the_options_come_before_those_of_the_file(here, tmp_path, inv
     assert told.mark_distance_m >= 0.3
     names = {"#" + "".join(f"{round(255 * float(c)):02x}" for c in rgb) for rgb in result.pattern.colours}
     assert names <= {"#dededa", "#303030"}
+
+
+def test_robust_comes_before_the_variation_of_the_file(here):
+    asked = dict.fromkeys(OPTIONS) | {"paint": here / "paint.toml"}
+    assert with_paint(asked)["paint"].variation == Variation(draws=2, wear=0.1)
+    assert with_paint(asked | {"robust": True})["paint"].variation == Variation()
 
 
 @pytest.mark.parametrize(
