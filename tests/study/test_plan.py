@@ -311,8 +311,9 @@ STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("*.toml"))
 def test_the_studies_that_come_with_the_project_can_be_read(path):
     study = load_study(path)
     searches = {method.search for method in study.methods}
-    assert "gradopt" in searches or path.stem == "cil-published"
-    assert {"published-bo", "published"} & searches or path.stem in ("ablation", "weathers")
+    hardened = path.stem.startswith("hardened-")
+    assert "gradopt" in searches or hardened or path.stem == "cil-published"
+    assert {"published-bo", "published"} & searches or hardened or path.stem in ("ablation", "weathers")
     assert len(study.jobs) == len({job.key for job in study.jobs})
 
 
