@@ -51,8 +51,9 @@ def test_the_estimate_counts_the_drives_over_the_bare_road_that_are_asked_for(in
 
 def test_the_estimate_counts_drives_through_the_town_where_they_are_made(invoke):
     asked = ("harden", "pilotnet", "--train-on", "left-07", "--rounds", "1", "--dry-run", "--json", "--simulator")
-    town, server = (json.loads(invoke(*asked, world)[1].out)["drives"] for world in ("town", "carla://localhost:2000"))
-    assert town - server == 80
+    worlds = ("town", "town:egl", "carla://localhost:2000")
+    software, egl, server = (json.loads(invoke(*asked, world)[1].out)["drives"] for world in worlds)
+    assert software - server == egl - server == 80
 
 
 def test_the_estimate_counts_all_drives_of_judging_and_what_is_done_at_once(invoke, monkeypatch):

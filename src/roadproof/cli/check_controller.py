@@ -51,9 +51,8 @@ def _driven(
     spec: str, scenarios: Sequence[Scenario], sky: Weather, cars: int, pedestrians: int, processes: int
 ) -> list[dict[str, Any]]:
     """Drive, say how it went, and tell what came of each scenario."""
-    # Panda3D is an extra.
     from roadproof.cli.progress import progress
-    from roadproof.training.scores import BareDrive, score_drives
+    from roadproof.training.scores import BareDrive, score_drives  # needs Panda3D, which is an extra
 
     wanted = [BareDrive(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in scenarios]
     scored: list[tuple[BareDrive, DrivingScore]] = []

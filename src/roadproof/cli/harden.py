@@ -55,7 +55,7 @@ def harden(
     from roadproof.hardening.tuning import training_step as usual_step
     from roadproof.scenarios import find_scenario
     from roadproof.search_space import SearchSpace
-    from roadproof.simulators.loading import open_simulator
+    from roadproof.simulators.loading import is_server, open_simulator
 
     options.check_processes(simulator, processes)
     known = options.scenarios_of(scenarios)
@@ -76,8 +76,9 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    asked = spent if simulator == "town" else replace(spent, town_drives=0)
-    begin(_workload(asked, who, rounds, len(training), len(judging), len(clean), processes), out)
+    # A server has no town of ours to drive through.
+    estimated = replace(spent, town_drives=0) if is_server(simulator) else spent
+    begin(_workload(estimated, who, rounds, len(training), len(judging), len(clean), processes), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,

@@ -108,8 +108,9 @@ def _device(device: str) -> str:
     return str(device_of(device))
 
 
-TRAINABLE = "a shipped one (`roadproof controllers`), a .safetensors file, cil:FILE, pilotnet:FILE or module:factory."
-CONTROLLERS = TRAINABLE.replace(".safetensors file", ".safetensors, .pt2 or .onnx file")
+_CONTROLLERS = "a shipped one (`roadproof controllers`), a {} file, cil:FILE, pilotnet:FILE or module:factory."
+CONTROLLERS = _CONTROLLERS.format(".safetensors, .pt2 or .onnx")
+TRAINABLE = _CONTROLLERS.format(".safetensors")
 ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"What is tested: {CONTROLLERS}")]
 DriverSpec: TypeAlias = Annotated[
     str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {CONTROLLERS}")

@@ -188,7 +188,7 @@ class _Check:
                 bare = self._stretch(place, world, scenario, ())
                 self._drive(place, bare)
                 drives_well = any(not each.wrong for each in bare.bare(plan.weathers[0]))
-                missing = f"no attack could be made: on the bare road no drive went well in {plan.weathers[0]}"
+                missing = f"on the bare road no drive went well in {plan.weathers[0]}"
                 paints += tuple(
                     self._fresh(world, scenario, seed) if drives_well else self._unsearched(scenario, seed, missing)
                     for seed in plan.seeds
@@ -263,7 +263,7 @@ class _Check:
         try:
             found = self._attacked(world, scenario, seed)
         except CanvasNotReachedError as error:
-            return self._unsearched(scenario, seed, f"no attack could be made: {error}")
+            return self._unsearched(scenario, seed, str(error))
         path = self.folder / PATTERNS / scenario.name / f"{name}.json"
         save_pattern(found.pattern, path)
         drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
@@ -293,7 +293,7 @@ class _Check:
         path = self.folder / PATTERNS / scenario.name / f"not-searched-{seed}.json"
         pattern = SearchSpace(figures=self.plan.figures).drawn(1, seed)[0]
         save_pattern(pattern, path)
-        return Paint(path.stem, Kind.FRESH, fresh(seed), pattern, path, (), why)
+        return Paint(path.stem, Kind.FRESH, fresh(seed), pattern, path, (), f"no attack could be made: {why}")
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows.

@@ -109,7 +109,7 @@ def harden(
     for each in dict.fromkeys((*streets, *clean_on)):
         require_route(simulator, each)
     network = load_trainable(controller)
-    _require_others(controller, folder)
+    _keep_apart(controller, folder)
     plan = HardeningPlan(
         spec=controller,
         scenarios=tuple(scenarios),
@@ -148,7 +148,7 @@ def harden(
     return found
 
 
-def _require_others(controller: str, folder: Path) -> None:
+def _keep_apart(controller: str, folder: Path) -> None:
     """See that no weights of the user's are written over, or taken for those of a round."""
     own = {each.resolve() for each in (folder / WEIGHTS, *folder.glob(f"round-*/{WEIGHTS}"))}
     for path in files_of(controller):
