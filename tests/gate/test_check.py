@@ -281,6 +281,23 @@ def test_an_attack_that_cannot_be_made_is_a_case_with_its_reason(team, tmp_path,
     assert "not-searched-0.json" in result.cases[1].command
 
 
+def test_a_fresh_attack_of_an_edited_plan_has_a_folder_of_its_own(team, tmp_path, monkeypatch):
+    needs.town()
+    folders = list[str]()
+
+    def noted(_world, _controller, _scenario, folder, **_):
+        folders.append(folder.name)
+        raise CanvasNotReachedError("noted")
+
+    monkeypatch.setattr("roadproof.gate.check.stress_test", noted)
+    plan, known = full_plan(team), load_controller("pilotnet")
+    for each in (plan, plan, replace(plan, figures=4), replace(plan, paint=PaintLimits(max_area_m2=2.0))):
+        run_check(each, known, tmp_path)
+    first, again, fewer, limited = zip(folders[::2], folders[1::2], strict=True)
+    assert first == again
+    assert len({*first, *fewer, *limited}) == 6
+
+
 def test_random_patterns_are_one_case(team, tmp_path):
     text = PLAN.replace("random = 0", "random = 3").replace('patterns = "patterns"', "")
     (team / "random.toml").write_text(text + "random = { left_lane = 1.0 }\n")
@@ -402,11 +419,11 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     assert not any(path.exists() for path in left)
     # What nobody's check has left is nobody's to take away.
     own = tmp_path / "own" / "summary.md"
-    own.parent.mkdir()
+    (own.parent / "drives" / "monday").mkdir(parents=True)
     own.write_text("mine")
     code, said = invoke(*command[:2], "--out", own.parent)
     assert (code, own.read_text()) == (2, "mine")
-    assert "is no check's, without check.json or drives beside it" in said.err
+    assert "is no check's, without check.json or a check's drives beside it" in said.err
     code, said = invoke(*command, "--accept")
     assert code == 2
     assert "names none; add [change]" in said.err

@@ -3,11 +3,13 @@
 import dataclasses
 
 import pytest
+import torch
 
 from roadproof.attacks import RandomSearch, SteeringShift
 from roadproof.coverage import Shape
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, by_street, check_streets
+from roadproof.paint import LaneMark, PaintLimits, Site
 from roadproof.pipeline.budget import QUICK
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
@@ -55,6 +57,23 @@ def test_budgets_judge_by_kinds_that_training_did_not_use():
         assert same == SearchSpace(figures=3)
         assert method == budget.judge.method
         assert (shapes.figures, shapes.shape) == (3, Shape.ELLIPSE)
+
+
+@pytest.mark.parametrize("family", ["published", "free"])
+def test_training_can_paint_what_attacks_find_clear_of_lane_marks(family):
+    marks = (LaneMark(points_m=((3.0, -5.0), (3.0, 15.0)), width_m=0.15, colour="#ffffff"),)
+    site = Site(size_m=(6.6, 9.5), marks=marks)
+    limited = SearchSpace(figures=3, family=family, limits=PaintLimits(keep_out_m=0.3)).on(site)
+    found = limited.drawn(40, 0)
+    learnt, *others = HardeningBudget().learnt(limited)
+    again = learnt.pattern(learnt.point(found))
+    # Not where next to nothing is left of a figure, nor where its middle lies beyond the canvas.
+    x, y, width, length, _ = found.boxes.unbind(-1)
+    paints = (width > 5) & (length > 20) & (torch.stack([x, y]) >= 0).all(0) & (torch.stack([x, y]) <= 400).all(0)
+    assert paints.float().mean() > 0.7
+    torch.testing.assert_close(again.boxes[paints], found.boxes[paints], atol=0.01, rtol=1e-4)
+    assert not learnt.is_limited
+    assert learnt not in others
 
 
 def test_judging_paints_in_other_shapes_what_else_the_space_allows():

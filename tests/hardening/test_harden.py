@@ -143,10 +143,33 @@ def test_one_that_no_longer_drives_a_street_for_judging_is_told_with_the_reason(
     plan.round(1).mkdir(parents=True)
     save_controller(network, plan.weights(1), origin="spoilt")
     far = street(tmp_path, "far", 25.0)
+    before = stages_of(plan, town).judge_before([near, far])
+    assert {each.after for each in before} == {False}
     judged, unjudged = stages_of(plan, town, processes=2).judge(1, [near, far])
-    assert {each.after for each in judged} == {False}, "the controller before is judged as ever"
-    assert list(unjudged) == ["near", "far"]
+    assert (judged, list(unjudged)) == ((), ["near", "far"])
     assert stages_of(plan, town).judge(1, [near, far]) == (judged, unjudged)
+
+
+def test_a_street_for_judging_that_the_controller_does_not_drive_is_refused_before_anything_is_learnt(town, tmp_path):
+    late = dataclasses.replace(street(tmp_path, "late", 115.0), time_limit_s=0.6)
+    with pytest.raises(TrainingError, match=r"^late cannot be judged on: .*; judge on streets that the controller dr"):
+        run(town, tmp_path / "out", judge_on=[late])
+    assert not list((tmp_path / "out").glob("round-0/near*"))
+
+
+def test_weights_that_are_not_judged_yet_do_not_replace_those_that_are(town, tmp_path):
+    out = tmp_path / "out"
+    run(town, out, judge_on=())
+    kept = (out / "hardened.safetensors").read_bytes()
+
+    def stop(title, *_):
+        if title.startswith("Bare road, after"):
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        run(town, out, rounds=2, on_progress=stop)
+    assert (out / "round-2" / "hardened.safetensors").exists()
+    assert (out / "hardened.safetensors").read_bytes() == kept
 
 
 def test_a_file_that_is_damaged_is_no_verdict(town, tmp_path, monkeypatch):
@@ -155,7 +178,7 @@ def test_a_file_that_is_damaged_is_no_verdict(town, tmp_path, monkeypatch):
 
     monkeypatch.setattr(StreetJudge, "judge", damaged)
     with pytest.raises(RecordingError, match="damaged"):
-        stages_of(planned(tmp_path, TINY), town).judge(1, [street(tmp_path, "near", 15.0)])
+        stages_of(planned(tmp_path, TINY), town).judge(0, [street(tmp_path, "near", 15.0)])
 
 
 def test_starts_off_the_road_of_a_street_for_judging_are_refused_before_anything_is_driven(town, tmp_path):

@@ -82,6 +82,19 @@ def test_scenarios_of_one_street_count_once():
     assert alone.change_m.value == pytest.approx(-(1.7 + 1.3 + 1.0) / 3)
 
 
+def test_scenarios_of_one_street_that_left_out_other_starts_are_averaged_from_the_same_one():
+    rows = (
+        *judged("a", "k", [1.0, 2.0, 3.0], [0.9, 1.5, 2.1], ([2, 3, 4], [2, 3, 4])),
+        *judged("b", "k", [3.0, 2.0, 1.0], [2.1, 1.5, 0.9], ([1, 2, 3], [1, 2, 3])),
+    )
+    told = Judgement(rows, (BareDrives(4, 4, ()),) * 2, streets=(("a", "b"),)).verdict().compared
+    # From start 2 by 0.1 and 0.5 less, from start 3 by 0.5 and 0.1.
+    assert (told.over, told.change_m.count, told.change_m.value) == ("starts", 2, pytest.approx(-0.3))
+    apart = (*judged("a", "k", [1.0], [0.5], ([1], [1])), *judged("b", "k", [1.0], [0.2], ([2], [2])))
+    none = Judgement(apart, (BareDrives(4, 4, ()),) * 2, streets=(("a", "b"),)).verdict().compared
+    assert (none.change_m.low, none.change_m.value) == (None, pytest.approx(-0.65))
+
+
 def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
     assert verdict(("a", "k", [1.0], [0.1]), ("b", "k", [1.0], [1.2])).outcome == "not shown"
     assert verdict(("a", "k", [1.0], [1.9]), ("b", "k", [1.0], [2.0])).outcome == "did not help"

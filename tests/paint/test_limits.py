@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -181,6 +181,14 @@ def test_limits_that_leave_no_pattern_or_lack_something_are_one_line(limits, sit
     with pytest.raises(PatternError, match=message) as refused:
         SearchSpace(figures=2, limits=PaintLimits(**limits)).on(site)
     assert "\n" not in str(refused.value)
+
+
+def test_a_narrow_albedo_is_refused_for_print_alone():
+    narrow = SearchSpace(figures=2, albedo=(0.5, 0.5005), limits=PaintLimits(max_area_m2=2.0)).on(SITE)
+    colours = narrow.drawn(8, 0).colours
+    assert 0.5 <= float(colours.min()) <= float(colours.max()) <= 0.5005 + 1e-6
+    with pytest.raises(PatternError, match="can be printed; widen it"):
+        replace(narrow, limits=PaintLimits(printable=True)).on(SITE)
 
 
 def test_black_that_no_limit_leaves_is_refused():

@@ -152,6 +152,13 @@ def test_limit_costs_in_a_file_that_is_none_are_named(tmp_path):
             {"space": SearchSpace(figures=1, limits=PaintLimits(printable=True))},
             "in metres of deviation, the search is for the st",
         ),
+        (
+            {
+                "budget": dataclasses.replace(TINY, objective=PathDeviation()),
+                "space": SearchSpace(figures=1, limits=PaintLimits(max_area_m2=2.0), max_painted_share=0.05),
+            },
+            "limit costs know no max_painted_share, which is 0.05",
+        ),
     ],
 )
 def test_limit_costs_without_limits_or_metres_are_refused_before_anything_is_driven(town, tmp_path, given, message):

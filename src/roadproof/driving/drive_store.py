@@ -34,6 +34,7 @@ from roadproof.scenarios import identity as identity_of_scenario
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator, own_digest
 
 CLEAN = "clean"
+EPISODES = "episodes"
 
 AnyDriver: TypeAlias = Controller | Driver[Any]
 
@@ -165,7 +166,7 @@ class Episodes:
         return sees_canvas(path_of(Episode.load(self._path(drive))), self.scenario.canvas)
 
     def _path(self, drive: DriveConditions) -> Path:
-        return self.folder / "episodes" / self.file(drive)
+        return self.folder / EPISODES / self.file(drive)
 
 
 def make_missing(
@@ -203,7 +204,7 @@ def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
     Raises:
         EpisodeError: a drive is missing or damaged.
     """
-    return tuple(Episode.load(inside(folder / "episodes", name, "episode", EpisodeError)) for name in names)
+    return tuple(Episode.load(inside(folder / EPISODES, name, "episode", EpisodeError)) for name in names)
 
 
 def driver_in_words(driver: AnyDriver) -> str:

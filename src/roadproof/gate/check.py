@@ -23,7 +23,7 @@ from roadproof.attacks import site_of
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import architecture_of, identity_of
-from roadproof.driving.drive_store import Episodes, load_episodes
+from roadproof.driving.drive_store import EPISODES, Episodes, load_episodes
 from roadproof.driving.starts import NOMINAL, require_on_road
 from roadproof.errors import CanvasNotReachedError, CheckError
 from roadproof.gate.outputs import WORST, WORST_COLUMNS, write_junit, write_summary, write_worst
@@ -33,6 +33,8 @@ from roadproof.gate.result import AGAIN, Case, CheckResult, JudgedDrive, load_re
 from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.identity import digest, stated
+from roadproof.io.known import known_by
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.film import STRIP, STRIP_SIZE, Strip, film_drives, forget_film, pictures_at
@@ -127,8 +129,10 @@ def clear(folder: Path, references: Path | None) -> None:
         whose = "kept for a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
         raise CheckError(f"{folder / FILE} is {whose}; choose another folder for the results")
     found = [folder / name for name in OUTPUTS if (folder / name).exists()]
-    if found and not ((folder / FILE).is_file() or (folder / DRIVES).is_dir()):
-        raise CheckError(f"{found[0]} is no check's, without {FILE} or {DRIVES} beside it; choose another folder")
+    if found and not ((folder / FILE).is_file() or any((folder / DRIVES).glob(f"*/{EPISODES}"))):
+        raise CheckError(
+            f"{found[0]} is no check's, without {FILE} or a check's {DRIVES} beside it; choose another folder"
+        )
     for path in found:
         path.unlink()
 
@@ -270,15 +274,17 @@ class _Check:
         return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
 
     def _attacked(self, world: Simulator, scenario: Scenario, seed: int) -> StressTest:
-        """A fresh attack; its folder is this controller's own."""
-        plan, who = self.plan, identity_of(self.controller, (world.input.height_px, world.input.width_px))
+        """A fresh attack; its folder is this controller's and this plan's own."""
+        plan, space = self.plan, SearchSpace(figures=self.plan.figures, limits=self.plan.paint)
+        who = identity_of(self.controller, (world.input.height_px, world.input.width_px))
+        asked = digest(stated(known_by([who, plan.controller, plan.attack, space])))
         return stress_test(
             world,
             self.controller,
             scenario,
-            self.folder / "fresh" / f"{scenario.name}-{seed}-{who[:8]}",
+            self.folder / "fresh" / f"{scenario.name}-{seed}-{asked[:8]}",
             budget=plan.attack,
-            space=SearchSpace(figures=plan.figures, limits=plan.paint),
+            space=space,
             seed=seed,
             controller_name=plan.controller,
             device=self.device,

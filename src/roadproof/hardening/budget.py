@@ -79,6 +79,9 @@ class HardeningBudget:
     def learnt(self, space: SearchSpace) -> tuple[SearchSpace, ...]:
         """What training paints from: the space of its attacks without limits, and free figures of each shape seen."""
         own = space.unlimited
+        if space.limits is not None and space.limits.keep_out_m is not None:
+            # What keeps clear of lane marks was moved and cut, which the published families cannot say.
+            own = replace(own, family="free")
         free = [replace(own, family="free", shape=shape) for shape in Shape if shape is not self.unseen_shape]
         return own, *(each for each in free if each != own)
 

@@ -1,11 +1,12 @@
 """Hardening a controller: attack, fine-tune on what was found, attack afresh; then the judgement on other streets.
 
     OUT/run.json                       what was asked for, and what the stages took (`pipeline.stage_costs`)
+    OUT/round-0/judged/SCENARIO/       the judgement of the controller as it came (`hardening.judgement`)
     OUT/town/drive-00000.npz           drives through the town over bare roads; later rounds have their own
     OUT/round-0/SCENARIO/              the attack on the controller as it came (`pipeline.stress_test`)
     OUT/round-1/hardened.safetensors   the controller after the first tuning
     OUT/round-1/SCENARIO/              the attack afresh on it: its re-test, and what round 2 learns from
-    OUT/round-N/judged/SCENARIO/       the judgement, of round 0 and of the best round (`hardening.judgement`)
+    OUT/round-N/judged/SCENARIO/       the judgement of the best round
     OUT/hardened.safetensors           the best round's weights
     OUT/hardening.json, .html          what came of it
 
@@ -87,7 +88,8 @@ def harden(
 
     Raises:
         TrainingError: there are no rounds, the seed is out of range, streets for training and judging are not disjoint,
-            there are some for clean driving and none for judging, or the training step gives no finite loss.
+            there are some for clean driving and none for judging, the controller does not drive one for judging, or
+            the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: the folder holds another hardening, or a stage refuses; the message says why.
     """
@@ -127,15 +129,18 @@ def harden(
         unused = () if plan.weights(1).exists() else STEP_PARTS
         ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening", unused)
         stages = HardeningStages(plan, simulator, teacher, training_step, factory, processes, ledger, on_progress)
+        # First of all, so that a street which cannot be judged on is refused before anything is learnt.
+        before = stages.judge_before(judge_on)
         done = stages.rounds(rounds)
-        best = best_of(done)
-        weights = folder / WEIGHTS
-        write_atomically(weights, lambda part: shutil.copyfile(plan.weights(best), part))
-        judgement = None
+        best, judgement = best_of(done), None
         if judge_on:
             clean = stages.drive_clean(best, clean_on or streets)
-            judged, unjudged = stages.judge(best, judge_on)
-            judgement = Judgement(judged, clean, unjudged, by_street(judge_on))
+            after, unjudged = stages.judge(best, judge_on)
+            judgement = Judgement(before + after, clean, unjudged, by_street(judge_on))
+            ledger.calls("judge", sum(each.simulator_calls for each in judgement.judged))
+        # Not before they are judged: those of fewer rounds may lie there beside their own verdict.
+        weights = folder / WEIGHTS
+        write_atomically(weights, lambda part: shutil.copyfile(plan.weights(best), part))
         found = Hardened(
             controller=controller,
             hardened=plan.spec_with(weights),

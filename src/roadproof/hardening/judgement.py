@@ -205,20 +205,23 @@ class Judgement:
     def _compared(self, strongest: Sequence[tuple[JudgedAttack, JudgedAttack]]) -> BeforeAfter:
         """Both controllers over the strongest attack on each scenario, before and after."""
         scenarios = [one.scenario for one, _ in strongest]
-        pairs = [_from_common_starts(one, two) for one, two in strongest]
-        change = {name: np.subtract(two, one) for name, (one, two) in zip(scenarios, pairs, strict=True)}
+        pairs = {one.scenario: _from_common_starts(one, two) for one, two in strongest}
+        means = {name: np.mean(list(each.values()), 0) for name, each in pairs.items()}
         known = self.streets or [[name] for name in scenarios]
-        streets = [found for names in known if (found := [change[name] for name in names if name in change])]
-        # The scenarios of one street are driven from the same starts.
-        if len(streets) == 1 and len({len(each) for each in streets[0]}) == 1:
-            changes, over = np.mean(streets[0], 0).tolist(), "starts"
+        streets = [found for names in known if (found := [name for name in names if name in pairs])]
+        # The scenarios of one street are driven from the same starts, of which some may have left one out.
+        alone = [pairs[name] for name in streets[0]] if len(streets) == 1 else []
+        common = [start for start in alone[0] if all(start in each for each in alone)] if alone else []
+        if common:
+            changes, over = [np.mean([np.diff(each[start]) for each in alone]) for start in common], "starts"
         else:
-            changes, over = [float(np.mean([each.mean() for each in street])) for street in streets], "streets"
+            changes, over = [np.mean([np.diff(means[name]) for name in street]) for street in streets], "streets"
+        before_m, after_m = np.median(list(means.values()), 0)
         return BeforeAfter(
-            change_m=mean_95(changes),
+            change_m=mean_95([float(each) for each in changes]),
             over=over,
-            before_m=float(np.median([np.mean(one) for one, _ in pairs])),
-            after_m=float(np.median([np.mean(two) for _, two in pairs])),
+            before_m=float(before_m),
+            after_m=float(after_m),
             left_lane_before=self._left_lane(scenarios, after=False),
             left_lane_after=self._left_lane(scenarios, after=True),
         )
@@ -327,13 +330,11 @@ class StreetJudge:
         )
 
 
-def _from_common_starts(before: JudgedAttack, after: JudgedAttack) -> tuple[list[float], list[float]]:
-    """The deviations from the starts of both, metres; of all drives where they have none in common."""
+def _from_common_starts(before: JudgedAttack, after: JudgedAttack) -> dict[StartOffset | None, tuple[float, float]]:
+    """Both deviations from each start that both have, metres; where they have none in common, of all drives."""
     first, then = before.by_start(), after.by_start()
-    common = [start for start in first if start in then]
-    if not common:
-        return [before.mean_m], [after.mean_m]
-    return [first[start] for start in common], [then[start] for start in common]
+    common = {start: (metres, then[start]) for start, metres in first.items() if start in then}
+    return {**common} or {None: (before.mean_m, after.mean_m)}
 
 
 def clean_drives(

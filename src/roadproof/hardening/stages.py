@@ -139,27 +139,34 @@ class HardeningStages:
         _save(network, plan, number)
         path.unlink(missing_ok=True)
 
-    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[tuple[JudgedAttack, ...], dict[str, str]]:
-        """Judge the controllers before and after on other streets.
+    def judge(self, number: int, judge_on: Sequence[Scenario]) -> tuple[tuple[JudgedAttack, ...], dict[str, str]]:
+        """Judge the controller of a round on other streets; one after tuning when the one before, 0, has been.
 
         Returns:
-            Every kind of attack on every street, and why a street could not be judged after hardening, by its name.
+            Every kind of attack on every street, and why a street could not be judged, by its name.
         """
+        when = "after" if number else "before"
         judged, unjudged = list[JudgedAttack](), dict[str, str]()
         with self.ledger.stage("judge"):
-            # All before come first: the one after also drives over what was found against the one before.
-            for number, when in ((0, "before"), (best, "after")):
-                self._together(f"Judging {when}", _judge_street, number, judge_on)
-                for scenario in judge_on:
-                    told = self._under(f"Judging {when}, {scenario.name}")
-                    try:
-                        judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
-                    except CanvasNotReachedError as error:
-                        if not number:
-                            raise
-                        unjudged[scenario.name] = str(error)
-            self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
+            self._together(f"Judging {when}", _judge_street, number, judge_on)
+            for scenario in judge_on:
+                told = self._under(f"Judging {when}, {scenario.name}")
+                try:
+                    judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
+                except CanvasNotReachedError as error:
+                    unjudged[scenario.name] = str(error)
         return tuple(judged), unjudged
+
+    def judge_before(self, judge_on: Sequence[Scenario]) -> tuple[JudgedAttack, ...]:
+        """Judge the controller as it came, on streets that it has to drive.
+
+        Raises:
+            TrainingError: it does not drive one of them as far as its canvas.
+        """
+        judged, unjudged = self.judge(0, judge_on)
+        for name, why in unjudged.items():
+            raise TrainingError(f"{name} cannot be judged on: {why}; judge on streets that the controller drives")
+        return judged
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[BareDrives, BareDrives]:
         """Drive over the bare road with the controllers before and after."""
@@ -239,8 +246,8 @@ def _drive_in_town(plan: HardeningPlan, number: int, town: TownSimulator, drive:
 
 
 def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
-    # Where the hardened controller no longer drives is told where all streets are gathered.
-    with suppress(*((CanvasNotReachedError,) if number else ())):
+    # Where a controller does not drive is told where all streets are gathered.
+    with suppress(CanvasNotReachedError):
         StreetJudge(plan, simulator, number, scenario, _go_on).judge()
 
 

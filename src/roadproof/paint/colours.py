@@ -105,7 +105,7 @@ def allowed_colours(
         more, ends = _hull(np.array([rgb_of(each) for each in PRINT]))
         rows, bounds = np.concatenate([rows, more]), np.concatenate([bounds, ends])
     corners = _corners(rows, bounds)
-    if not len(corners) or np.ptp(corners, axis=0).max() < 1e-3:
+    if printable and (not len(corners) or np.ptp(corners, axis=0).max() < 1e-3):
         raise PatternError(f"no colour with an albedo of {albedo[0]:g} to {albedo[1]:g} can be printed; widen it")
     middle = corners.mean(0)
     near = far = middle

@@ -180,12 +180,16 @@ def relaxed_limits(space: SearchSpace, objective: Objective) -> Mapping[str, Pai
     """The limits of a space without each of them, by its name, and without any, where that is asked for.
 
     Raises:
-        PatternError: there is no limit.
+        PatternError: there is no limit, or the space has one of its own.
         RoadproofError: the search is not for a path deviation.
     """
     if not isinstance(objective, PathDeviation):
         raise RoadproofError(
             f"limit costs are in metres of deviation, the search is for the {objective.name}; leave one of them out"
+        )
+    if space.max_painted_share is not None:
+        raise PatternError(
+            f"limit costs know no max_painted_share, which is {space.max_painted_share:g}; limit the area in m² instead"
         )
     if space.limits is None or not space.limits.relaxed:
         raise PatternError("limit costs were asked for, but there is no limit on paint; give one, such as --max-area")

@@ -17,7 +17,7 @@ from pathlib import Path
 from roadproof.calibration import Calibrated
 from roadproof.controllers import Controller
 from roadproof.drives import Drives
-from roadproof.driving.drive_store import Episodes
+from roadproof.driving.drive_store import EPISODES, Episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import OutputError, RoadproofError
@@ -120,7 +120,7 @@ class SharedRecordings:
 def bring_bare_drives(shared: Path, evaluation: Path) -> None:
     """Give an evaluation the drives over the bare road that others have made, but none that is damaged."""
     for file in shared.glob(_CLEAN):
-        if not (place := evaluation / "episodes" / file.name).exists():
+        if not (place := evaluation / EPISODES / file.name).exists():
             try:
                 Episode.load(file)
             except RoadproofError:
@@ -131,16 +131,16 @@ def bring_bare_drives(shared: Path, evaluation: Path) -> None:
 
 def keep_bare_drives(shared: Path, evaluation: Path, told: Evaluation) -> None:
     """Keep the drives over the bare road that an evaluation made, and leave it those that it tells of."""
-    _link(evaluation / "episodes", shared, _CLEAN)
+    _link(evaluation / EPISODES, shared, _CLEAN)
     kept = {trial.clean for trial in told.trials}
-    for file in list((evaluation / "episodes").glob(_CLEAN)):
+    for file in list((evaluation / EPISODES).glob(_CLEAN)):
         if file.name not in kept:
             file.unlink()
 
 
 def bare_drives(job: Job, world: Simulator, controller: Controller, work: Path) -> Path:
     """The folder of the drives over the bare road with which a job's patterns are compared."""
-    return _folder(job, world, controller, work, "bare") / "episodes"
+    return _folder(job, world, controller, work, "bare") / EPISODES
 
 
 def _folder(job: Job, world: Simulator, controller: Controller, work: Path, asked: str) -> Path:
