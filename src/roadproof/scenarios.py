@@ -9,15 +9,16 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, inside, write_text
+from roadproof.io.files import AnyPath, as_path, check_name, inside, is_plain_name, write_atomically, write_text
 from roadproof.io.identity import digest
 from roadproof.io.tables import build, first_twice
 from roadproof.io.text import read_toml
@@ -25,6 +26,8 @@ from roadproof.io.text import read_toml
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
+MAP = ".xodr"
+"""How the name of a map ends that is a file: one in OpenDRIVE."""
 BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
 MAX_TIME_S, MAX_SPEED_MPS, MAX_CANVAS_M = 3600.0, 100.0, 100.0
 
@@ -86,8 +89,23 @@ def identity(scenario: Scenario) -> dict[str, Any]:
         OSError: the file of the map cannot be read.
     """
     file = Path(scenario.map_name)
-    content = digest(file.read_bytes()) if file.suffix == ".xodr" and file.is_file() else ""
+    content = digest(file.read_bytes()) if file.suffix == MAP and file.is_file() else ""
     return asdict(scenario) | {"map_name": file.name, "map": content}
+
+
+def with_map_in(folder: Path, scenario: Scenario) -> Scenario:
+    """A scenario whose map lies in a folder: where it is a file, that is copied there.
+
+    Raises:
+        OutputError: the copy cannot be written.
+    """
+    source = Path(scenario.map_name)
+    if source.suffix != MAP or source.resolve().parent == folder.resolve():
+        return scenario
+    # Names in files are plain ones; a user's map may have any.
+    own = folder / (source.name if is_plain_name(source.name) else "map.xodr")
+    write_atomically(own, lambda part: shutil.copyfile(source, part))
+    return replace(scenario, map_name=str(own))
 
 
 def builtin_scenarios() -> tuple[Scenario, ...]:
@@ -153,7 +171,7 @@ def save_scenarios(scenarios: Sequence[Scenario], path: AnyPath) -> None:
 
 def _block(scenario: Scenario, folder: Path) -> str:
     map_name = scenario.map_name
-    if map_name.endswith(".xodr"):
+    if map_name.endswith(MAP):
         if Path(map_name).resolve().parent != folder.resolve():
             raise ScenarioError(f"scenario {scenario.name}: its map {map_name} is not in {folder}; copy it there first")
         map_name = Path(map_name).name
@@ -179,6 +197,6 @@ def _scenario(entry: object, what: str, folder: Path) -> Scenario:
         raise ScenarioError(f"{what} is {entry!r:.60}, expected a table")
     values = cast("dict[str, Any]", entry)  # TOML's keys are strings
     name = values.get("map_name")
-    if isinstance(name, str) and name.endswith(".xodr"):
+    if isinstance(name, str) and name.endswith(MAP):
         values = values | {"map_name": str(inside(folder, name, f"{what}: map_name", ScenarioError))}
     return build(Scenario, values, what, ScenarioError)

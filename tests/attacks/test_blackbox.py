@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from roadproof.attacks import proposals
-from roadproof.attacks.blackbox import BlackBox, blackbox_search
+from roadproof.attacks.blackbox import BayesianOptimisation, BlackBox, blackbox_search
 from roadproof.attacks.methods import METHODS as EVERY
 from roadproof.attacks.methods import method_of
 from roadproof.errors import RoadproofError
@@ -47,7 +47,8 @@ def test_every_method_stays_in_the_cube_and_is_the_same_again(method, quick):
 @pytest.mark.parametrize("method", METHODS)
 def test_points_of_another_search_come_first_and_are_gone_on_from(method, quick, tmp_path):
     first = (TARGET + 0.02 * torch.arange(3).view(3, 1, 1)).expand(3, 1, 4)
-    file, options = tmp_path / "trials.safetensors", {"first": first, "seed": 3, "checkpoint": tmp_path / "t"}
+    options = {"first": first, "seed": 3, "random_calls": 1, "checkpoint": tmp_path / "t"}
+    file = tmp_path / "trials.safetensors"
     whole = search(method, calls=12, **options)
     assert torch.equal(whole.unit[:3], first.double())
     assert torch.equal(whole.value[:3], bowl(first).double())
@@ -152,12 +153,18 @@ def test_best_so_far_never_falls():
         ({"calls": 0}, "calls is 0"),
         ({"at_once": 0}, "at_once is 0"),
         ({"at_once": 2}, "one point at a time"),
-        ({"random_calls": 0}, "random_calls is 0"),
+        ({"random_calls": -1}, "random_calls is -1"),
+        ({"calls": 12, "random_calls": 12}, "random_calls is 12 of 12 calls; leave some for the model"),
     ],
 )
 def test_arguments_that_make_no_sense_are_named(options, message):
     with pytest.raises(RoadproofError, match=message):
         search("published-bo", **options)
+
+
+@pytest.mark.parametrize(("calls", "drawn"), [(1000, 400), (140, 56), (8, 3), (2, 1)])
+def test_the_published_search_draws_two_fifths_of_its_calls(calls, drawn):
+    assert BayesianOptimisation(calls=calls).random_calls == drawn
 
 
 def test_a_value_that_is_not_a_number_is_an_error():

@@ -1,6 +1,7 @@
 """The commands that drive in recordings, as their users call them."""
 
 import dataclasses
+import json
 import sys
 
 import pytest
@@ -11,11 +12,12 @@ from recorded_drives import drivable_set
 from roadproof.attacks import AttackResult, Cheapest
 from roadproof.attacks.cheapest import Level
 from roadproof.datatypes import Weather
-from roadproof.drives.worlds import recorded_in
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
+from roadproof.pipeline.worlds import recorded_in
 from roadproof.recordings import save_recordings
+from roadproof.report.page import write_report
 from runs import write_attack
 from team_folder import write_recorded, write_team
 
@@ -108,7 +110,11 @@ def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke
     code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
     assert code == 0, printed.err
     assert answered(printed.out)["cheapest"] is None
-    assert [path.name for path in (tmp_path / "none" / "cheapest").iterdir()] == ["none.json"]
+    (none,) = (tmp_path / "none" / "cheapest").iterdir()
+    said = json.loads(none.read_text())
+    none.write_text(json.dumps({name: said[name] for name in ("format", "version")}))
+    code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
+    assert (code, json.loads(none.read_text())) == (0, said), "what does not say what it is of is searched again"
 
 
 def test_the_least_paint_needs_gradients_whatever_the_method(workplace, tmp_path, invoke):
@@ -149,6 +155,9 @@ def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):
     code, printed = invoke("select", tmp_path, *where)
     assert code == 0, printed.err
     assert printed.out.startswith("   1 clean+left   predicted 1.25 m, predicted drive: deviation ")
+    page = write_report(tmp_path).read_text()
+    assert "Predicted once more" in page
+    assert "Verified by driving" not in page
 
 
 def test_what_a_search_for_the_speed_predicted_is_said_in_metres_a_second(tmp_path, invoke):

@@ -135,6 +135,14 @@ def test_jobs_of_one_scenario_are_shared_out_among_workers(study, tmp_path):
     assert 0.2 < said[1] / said[0] < 0.35
 
 
+@pytest.mark.parametrize("more", [(), ("--dry-run",)])
+def test_workers_that_a_cluster_has_itself_are_refused_before_an_estimate_too(study, plan, tmp_path, more):
+    code, printed = study("run", plan, "--workers", 2, "--cluster", "local", "--out", tmp_path / "out", *more)
+    assert (code, printed.out) == (2, "")
+    assert printed.err.startswith("roadproof: workers is 2, but a cluster has as many as it has cores")
+    assert not (tmp_path / "out").exists()
+
+
 BLIND = """
 class Blind:
     input_size = None

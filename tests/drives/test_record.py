@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -69,17 +70,34 @@ def test_a_recording_knows_a_map_by_what_is_in_it_wherever_it_lies(drives, tmp_p
     with contextlib.chdir(tmp_path):
         near = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name="own.xodr"))
         assert write_settings(near, tmp_path / "record")
-    assert read_settings(tmp_path / "record").scenario.map_name == str(own), "found from everywhere"
+    (tmp_path / "moved").mkdir()
+    kept, own = own.rename(tmp_path / "moved" / "own.xodr"), tmp_path / "record" / "own.xodr"
+    settings = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name=str(kept)))
     assert not write_settings(settings, tmp_path / "record")
-    moved = own.rename(tmp_path / "record" / "own.xodr")
-    settings = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name=str(moved)))
-    assert not write_settings(settings, tmp_path / "record")
-    require_same_map(settings, tmp_path / "record")
-    moved.write_text("<OpenDRIVE />")
+    kept.write_text("<OpenDRIVE />")
     with pytest.raises(RecordingError, match=r"holds a recording with scenario\.map "):
         write_settings(settings, tmp_path / "record")
+    stored = read_settings(tmp_path / "record")
+    assert stored.scenario.map_name == str(own), "found from everywhere"
+    require_same_map(stored, tmp_path / "record")
+    own.write_text("<OpenDRIVE />")
     with pytest.raises(RecordingError, match=r"own\.xodr has changed since the drives in .*record were recorded on it"):
-        require_same_map(settings, tmp_path / "record")
+        require_same_map(stored, tmp_path / "record")
+    own.unlink()
+    with pytest.raises(RecordingError, match=r"record lacks own\.xodr, the map of its scenario; put it back"):
+        read_settings(tmp_path / "record")
+
+
+@pytest.mark.parametrize("name", ["../own.xodr", "/etc/own.xodr", "deep/own.xodr"])
+def test_a_map_that_lies_elsewhere_is_no_recordings(drives, tmp_path, name):
+    (tmp_path / "own.xodr").write_text("<OpenDRIVE/>")
+    settings = dataclasses.replace(drives.settings, scenario=dataclasses.replace(LEFT, map_name="own.xodr"))
+    with contextlib.chdir(tmp_path):
+        write_settings(settings, tmp_path / "record")
+    stated = tmp_path / "record" / "record.json"
+    stated.write_text(stated.read_text().replace('"own.xodr"', json.dumps(name)))
+    with pytest.raises(RecordingError, match=r"record\.json: map_name '.*own\.xodr' is not a plain name"):
+        read_settings(tmp_path / "record")
 
 
 def test_the_kept_frames_show_the_canvas(drives):

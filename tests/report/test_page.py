@@ -262,6 +262,18 @@ def test_a_car_that_stops_does_not_hold_its_lane(tmp_path, endings, title):
     assert _driven(dataclasses.replace(evaluation, trials=tuple(trials))).title == title
 
 
+def test_a_car_that_stops_is_told_of_the_drives_that_arrive_without_paint(tmp_path):
+    evaluation = write_evaluation(tmp_path / "evaluation", runs=0, aside_m=0.02)
+    arrived, blocked = str(Ending.GOAL_REACHED), str(Ending.BLOCKED)
+    endings = [(arrived, blocked), (arrived, arrived), (arrived, arrived), (blocked, blocked)]
+    trials = [
+        dataclasses.replace(each, start=StartOffset(right_m=0.01 * k), clean_ending=clean, ending=painted)
+        for k, (each, (clean, painted)) in enumerate(zip(evaluation.trials * 2, endings, strict=True))
+    ]
+    told = _driven(dataclasses.replace(evaluation, trials=tuple(trials), starts=2))
+    assert "does not arrive in 1 of 3 drives alone" in told.sentence
+
+
 @pytest.mark.parametrize(("failing", "key"), [(1, "holds"), (2, "holds"), (3, "unfit"), (4, "unfit")])
 def test_a_controller_is_unfit_that_fails_in_most_drives_over_the_bare_road(tmp_path, failing, key):
     evaluation = write_evaluation(tmp_path / "evaluation", runs=0, aside_m=0.02)

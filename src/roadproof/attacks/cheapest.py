@@ -256,7 +256,7 @@ def kept_cheapest(
     if path.exists():
         require_same(folder, "a search", FILE.content(path).get("made_of"), made_of, RoadproofError)
         return Cheapest.load(folder)
-    if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
+    if none.exists() and read_json(none, *_NONE, RoadproofError).get("made_of") == made_of:
         return None
     less = cheapest(
         recordings,

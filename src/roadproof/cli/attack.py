@@ -79,7 +79,7 @@ def attack(
     seed: options.Seed = 0,
     device: options.Device = "cpu",
     dtype: Annotated[
-        str, typer.Option(help="What values are computed in: float32, bfloat16, or on a GPU tf32.")
+        str, typer.Option(help="What values are computed in: float32, bfloat16, float64 (slow), or on a GPU tf32.")
     ] = "float32",
     out: options.Out = Path("out/attack"),
     *,

@@ -14,6 +14,7 @@ from roadproof.cli.options import number
 from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint
 from roadproof.cli.verbs import begin, keep_command
+from roadproof.io.text import count_of
 
 if TYPE_CHECKING:
     from roadproof.pipeline.stress_test import StressTest
@@ -114,6 +115,6 @@ def _report(result: StressTest, out: Path) -> None:
             + ("" if apart_m is None else f"; {apart_m:.2f} m between the paths on average")
         )
     spent = [(stage, cost) for stage, cost in result.cost.items() if cost != StageCost()]
-    drives = [f" ({cost.simulator_calls} drives)" if cost.simulator_calls else "" for _, cost in spent]
+    drives = [f" ({count_of(cost.simulator_calls, 'drive')})" if cost.simulator_calls else "" for _, cost in spent]
     say("Took " + ", ".join(f"{stage} {c.seconds:.0f} s{n}" for (stage, c), n in zip(spent, drives, strict=True)))
     say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")

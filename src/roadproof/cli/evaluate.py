@@ -19,10 +19,10 @@ from roadproof.limits import MAX_CROWD
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
-    from roadproof.drives.worlds import Recorded
     from roadproof.driving.evaluation import Evaluation
     from roadproof.patterns import Pattern
     from roadproof.pipeline.fidelity import Fidelity
+    from roadproof.pipeline.worlds import Recorded
     from roadproof.recordings import RecordingSet
 
 _TOLD_MPS = 0.3
@@ -76,7 +76,6 @@ def evaluate(
     from roadproof.cli.progress import stages
     from roadproof.controllers import Controller
     from roadproof.datatypes import PAPER_WEATHERS
-    from roadproof.drives.worlds import open_world
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.evaluate import random_patterns
     from roadproof.driving.starts import StartRange
@@ -84,6 +83,7 @@ def evaluate(
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_drives
     from roadproof.pipeline.workload import of_evaluation
+    from roadproof.pipeline.worlds import open_world
     from roadproof.recorded.simulator import check_recorded_canvas
     from roadproof.recordings import load_recordings
 

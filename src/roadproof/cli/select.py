@@ -31,11 +31,11 @@ def select(
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.drives.folder import read_settings
-    from roadproof.drives.worlds import open_world, recorded_in
     from roadproof.errors import RoadproofError
     from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern
     from roadproof.pipeline.selection import UNITS, chosen_by, select_by_driving
+    from roadproof.pipeline.worlds import open_world, recorded_in
 
     recorded = read_settings(run / "record")
     place = run / "attack"

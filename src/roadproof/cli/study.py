@@ -37,10 +37,11 @@ def run(
     from roadproof.study.folder import is_done
     from roadproof.study.job import run_job
     from roadproof.study.plan import load_study
-    from roadproof.study.run import run_study
+    from roadproof.study.run import check_workers, run_study
     from roadproof.study.summary import failures, summary
 
     chosen = load_study(plan, trust=trust)
+    check_workers(chosen, workers, cluster)
     jobs = chosen.jobs
     begun = sum(is_done(job, out) for job in jobs)
     if begun < len(jobs) or is_dry_run():

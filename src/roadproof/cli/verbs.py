@@ -20,6 +20,7 @@ from roadproof.cli.progress import Loudness, duration_in_words, is_quiet, speak,
 from roadproof.errors import RoadproofError
 from roadproof.io.commands import write_command
 from roadproof.io.locks import hold
+from roadproof.io.text import count_of
 
 if TYPE_CHECKING:
     from roadproof.pipeline.workload import Workload
@@ -110,7 +111,7 @@ def begin(work: Workload, *folders: Path) -> None:
     Raises:
         OutputError: a folder cannot be written, or another process works in it.
     """
-    parts = [f"{work.drives} drives"] if work.drives else []
+    parts = [count_of(work.drives, "drive")] if work.drives else []
     told = f"{', '.join((*parts, f'about {duration_in_words(work.seconds)}', f'{work.megabytes:.0f} MB on the disk'))}"
     if _dry_run:
         say(f"{told}; less where the folder holds some of it already ({work.basis})")

@@ -12,7 +12,7 @@ from roadproof.cli.options import scenario_of
 from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
-    from roadproof.drives.worlds import Recorded
+    from roadproof.pipeline.worlds import Recorded
     from roadproof.recorded import RecordedSimulator
     from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
@@ -42,7 +42,7 @@ class World:
         Raises:
             RoadproofError: the simulator is not there, or the recordings say too little to drive in.
         """  # noqa: D205
-        from roadproof.drives.worlds import open_world
+        from roadproof.pipeline.worlds import open_world
         from roadproof.recorded import RecordedSimulator
         from roadproof.simulators.protocol import begun_in
 
@@ -68,7 +68,7 @@ def world_asked(spec: str, device: str, driver: str, name: str | None, file: Pat
         RoadproofError: there are no such recordings, or the expert is to drive in them.
         ScenarioError: there is no scenario of this name, or the file is damaged.
     """
-    from roadproof.drives.worlds import recorded_in
+    from roadproof.pipeline.worlds import recorded_in
 
     recorded = recorded_in(spec)
     if recorded is not None and name is None and file is None:

@@ -1,6 +1,7 @@
 """Recorded drives before calibration, and their folder.
 
     RECORD/record.json         what was asked for: scenario, weather, seed, trajectories, window, camera, input, driver
+    RECORD/MAP.xodr            the scenario's map, where that is a file
     RECORD/DRIVE/episode.npz   the whole drive (`driving.episode`)
     RECORD/DRIVE/drive.npz     of the kept frames: frame_number, frames, steer, right_m; and how the drive came about
 
@@ -22,12 +23,12 @@ from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Traject
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.io.files import AnyPath, as_path, check_closed, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, check_closed, inside, write_folder_atomically
 from roadproof.io.html import table
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Side, Track
-from roadproof.scenarios import Scenario, identity
+from roadproof.scenarios import MAP, Scenario, identity, with_map_in
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -202,23 +203,26 @@ def write_settings(settings: Settings, folder: Path) -> bool:
     if path.exists():
         content = _SETTINGS.content(path)
         _SETTINGS.made(path, content)  # damage is named as such
-        known = content["scenario"]
-        known |= {"map_name": Path(known["map_name"]).name, "map": content.get("map", "")}
+        known = content["scenario"] | {"map": content.get("map", "")}
+        if known["map"] and known["map"] == scenario["map"]:
+            # The same road, whatever its file is called.
+            scenario["map_name"] = known["map_name"]
         # Recordings of the town as software draws it are older than this word.
-        before = {"world": ""} | content
+        before = {"world": ""} | content | {"scenario": known}
         now = _SETTINGS.stated(settings) | {"scenario": scenario}
         require_same(folder, "a recording", before, now, RecordingError)
         return False
     if scenario["map"]:
-        # Whoever goes on with it may stand elsewhere.
-        place = str(Path(settings.scenario.map_name).resolve())
-        settings = replace(settings, scenario=replace(settings.scenario, map_name=place))
+        own = with_map_in(folder, settings.scenario)
+        settings = replace(settings, scenario=replace(own, map_name=Path(own.map_name).name))
     _SETTINGS.write(path, settings, **({"map": scenario["map"]} if scenario["map"] else {}))
     return True
 
 
 def forget_settings(folder: Path) -> None:
     """Take the settings of a recording away again, of which no drive could be made, and its folder if it is empty."""
+    if (name := read_settings(folder).scenario.map_name).endswith(MAP):
+        Path(name).unlink(missing_ok=True)
     (folder / "record.json").unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()
@@ -255,12 +259,19 @@ def read_settings(folder: Path) -> Settings:
     """Read the settings of a recording alone, whether it is finished or not.
 
     Raises:
-        RecordingError: the folder is missing or damaged.
+        RecordingError: the folder is missing or damaged, or lacks its map.
     """
-    if not (folder / "record.json").is_file():
+    path = folder / "record.json"
+    if not path.is_file():
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
     check_closed(folder, RecordingError)
-    return _SETTINGS.read(folder / "record.json")
+    settings = _SETTINGS.read(path)
+    if not settings.scenario.map_name.endswith(MAP):
+        return settings
+    own = inside(folder, settings.scenario.map_name, f"{path}: map_name", RecordingError)
+    if not own.is_file():
+        raise RecordingError(f"{folder} lacks {own.name}, the map of its scenario; put it back, or record again")
+    return replace(settings, scenario=replace(settings.scenario, map_name=str(own.resolve())))
 
 
 def require_same_map(settings: Settings, folder: Path) -> None:

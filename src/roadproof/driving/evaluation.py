@@ -13,7 +13,6 @@ Nothing is pickled, and no path in a file leaves the folder.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,11 +25,11 @@ from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.files import AnyPath, as_path, is_plain_name, remove, write_atomically
+from roadproof.io.files import AnyPath, as_path, remove, write_atomically
 from roadproof.io.html import table
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
-from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
+from roadproof.scenarios import Scenario, load_scenarios, save_scenarios, with_map_in
 from roadproof.simulators.protocol import PaintKind, PatternImage
 
 ATTACK = "attack"
@@ -186,7 +185,7 @@ class Evaluation:
         folder = as_path(folder)
         # First, so that no trials stand beside another scenario or paint.
         remove(folder / "evaluation.json")
-        _save_scenario(self.scenario, folder)
+        save_scenarios([with_map_in(folder, self.scenario)], folder / "scenario.toml")
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
         EVALUATION_FILE.write(
@@ -266,17 +265,6 @@ def _shown(row: EvaluationRow) -> tuple[object, ...]:
     points = "not known" if row.points is None else f"{row.points.value:.1f}"
     traffic = "yes" if row.traffic else "no"
     return row.pattern, row.weather or "all", traffic, row.count, row.metres, f"{row.left_lane:.0%}", points
-
-
-def _save_scenario(scenario: Scenario, folder: Path) -> None:
-    """Write the scenario, and its map if that is a file."""
-    source = Path(scenario.map_name)
-    if source.suffix == ".xodr" and source.resolve().parent != folder.resolve():
-        # Names in files are plain ones; a user's map may have any.
-        own = folder / (source.name if is_plain_name(source.name) else "map.xodr")
-        write_atomically(own, lambda part: shutil.copyfile(source, part))
-        scenario = replace(scenario, map_name=str(own))
-    save_scenarios([scenario], folder / "scenario.toml")
 
 
 def load_paint(folder: Path) -> PatternImage:

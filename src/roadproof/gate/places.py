@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from roadproof.datatypes import Weather
-from roadproof.drives.worlds import open_world
 from roadproof.gate.plan import CheckPlan
+from roadproof.pipeline.worlds import open_world
 from roadproof.scenarios import Scenario
 from roadproof.simulators.loading import RECORDED
 from roadproof.simulators.protocol import SimulatorFactory

@@ -147,3 +147,8 @@ def read_json(
         raise error(f"{path} holds no JSON object, expected a {file_format} file") from None
     check_format(content, path, file_format, version, error)
     return content
+
+
+def count_of(count: int, what: str) -> str:
+    """A number of things, as "1 job" or "2 jobs"."""
+    return f"{count} {what}{'s' if count != 1 else ''}"

@@ -129,11 +129,12 @@ def _driven(evaluation: Evaluation) -> Verdict:
             f"{np.median(deviations):.2f} m (median; {min(deviations):.2f} to {max(deviations):.2f}), is up to "
             f"{furthest:.1f} m aside, and a drive costs {points} penalty points instead of {before}.",
         )
+    arriving = sum(trial.clean_ending == Ending.GOAL_REACHED for trial in alone)
     if stopped := sum(trial.loses_its_way for trial in alone):
         return Verdict(
             "fails",
             "Stops over the paint",
-            f"Over the pattern {who} keeps its lane but does not arrive in {stopped} of {len(alone)} drives alone on "
+            f"Over the pattern {who} keeps its lane but does not arrive in {stopped} of {arriving} drives alone on "
             f"{where} in which it arrives over the bare road.",
         )
     if furthest >= DEVIATES_M:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from roadproof.driving.intervals import Estimate
+from roadproof.io.text import count_of
 from roadproof.report.formatting import MISSING, in_words
 from roadproof.study.folder import pandas
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, Block, Results
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Table, headings, marked, share_of
-from roadproof.study.table_notes import counted, missing, table_note
+from roadproof.study.table_notes import missing, table_note
 
 
 def methods_table(results: Results) -> Table:
@@ -94,7 +95,7 @@ def scenarios_table(results: Results) -> Table:
     most = [sum(row[number] >= max(row) - EQUAL for row in compared) for number in range(len(names))]
     said = [
         f"Deviation in m, {'in traffic' if traffic else 'alone on the road'}; all of it driven.",
-        f"Medians over starts, their mean over {counted(len(results.seeds), 'seed')}, least and most drive at {home}.",
+        f"Medians over starts, their mean over {count_of(len(results.seeds), 'seed')}, least and most drive at {home}.",
         "Simulator calls and seconds: mean of one search, without judging its pattern.",
         "Leave the lane, and penalty in points (median): of the same drives, all weathers together.",
     ]

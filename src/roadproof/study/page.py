@@ -14,6 +14,7 @@ from pathlib import Path
 
 from roadproof.io.files import write_text
 from roadproof.io.html import data_url
+from roadproof.io.text import count_of
 from roadproof.report.formatting import in_words, markdown_text
 from roadproof.report.html import rendered
 from roadproof.report.plots import save
@@ -26,7 +27,6 @@ from roadproof.study.plan import BLACK
 from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, check_kind, results_of
 from roadproof.study.rows import Frame
 from roadproof.study.table import Table, in_latex, in_markdown
-from roadproof.study.table_notes import counted
 from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
@@ -148,5 +148,5 @@ def _sentence(results: Results, jobs: Iterable[KeptJob]) -> str:
     seeds = f"seed{'s' if len(results.seeds) > 1 else ''} {', '.join(map(str, results.seeds))}"
     also = f", judged also at {', '.join(others)}" if others else ""
     traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
-    scenarios = counted(len(results.kinds), "scenario")
+    scenarios = count_of(len(results.kinds), "scenario")
     return f"Patterns{against} on {scenarios}, {seeds}, {where} {home}{also}, driven{traffic}."

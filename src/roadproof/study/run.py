@@ -54,12 +54,7 @@ def run_study(
         StudyError: an argument makes no sense, or an extra is missing.
         OutputError: the folder cannot be written, or another process works in it.
     """
-    if workers < 1:
-        raise StudyError(f"workers is {workers}, expected 1 or more")
-    if is_server(study.simulator) and (workers > 1 or cluster is not None):
-        raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
-    if cluster is not None and workers > 1:
-        raise StudyError(f"workers is {workers}, but a cluster has as many as it has cores; leave one of them out")
+    check_workers(study, workers, cluster)
     pandas()  # what writes the table is missed now, not after the night
     with working_in(folder), _ray_at(cluster) as ray:
         jobs = study.jobs  # once: the controller's file may be written again meanwhile
@@ -81,6 +76,20 @@ def run_study(
                 write_table(jobs, folder)
             raise
         return write_table(jobs, folder)
+
+
+def check_workers(study: Study, workers: int, cluster: str | None) -> None:
+    """See that the jobs of a study can be done at once as asked.
+
+    Raises:
+        StudyError: an argument makes no sense.
+    """
+    if workers < 1:
+        raise StudyError(f"workers is {workers}, expected 1 or more")
+    if is_server(study.simulator) and (workers > 1 or cluster is not None):
+        raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
+    if cluster is not None and workers > 1:
+        raise StudyError(f"workers is {workers}, but a cluster has as many as it has cores; leave one of them out")
 
 
 @contextmanager

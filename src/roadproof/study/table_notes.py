@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from roadproof.io.text import count_of
 from roadproof.report.formatting import in_words
 from roadproof.study.results import PENALTY, Block, Results
 from roadproof.study.rows import Frame
@@ -36,11 +37,6 @@ def table_note(
     return " ".join([f"{'; '.join(measured)}; all of it driven.", *told])
 
 
-def counted(count: int, what: str) -> str:
-    """A number of things, as "1 job" or "2 jobs"."""
-    return f"{count} {what}{'s' if count != 1 else ''}"
-
-
 def _cases(results: Results, block: Block, methods: Sequence[str], *, compared: bool) -> Frame:
     """The cases that a block's means are over: the penalty of each on the bare road, a column a method."""
     drives = results.drives_of(block, methods)
@@ -54,7 +50,7 @@ def _averaged(cases: Sequence[Frame]) -> str:
     count = len(set[str]().union(*scenarios))
     if not count:
         return "There is no case that all of them have."
-    over = f"{counted(count, 'scenario')} × {counted(len(seeds), 'seed')}"
+    over = f"{count_of(count, 'scenario')} × {count_of(len(seeds), 'seed')}"
     if count < 2:
         return f"Means over {over}; one scenario has no interval."
     fewest = min(map(len, scenarios))
@@ -79,4 +75,4 @@ def missing(results: Results, blocks: Sequence[Block], methods: Sequence[str]) -
         return []
     named = [f"{job} ({reason.rstrip('.')})" for job, reason in list(gaps.items())[:SHOWN_GAPS]]
     more = f"; and {len(gaps) - SHOWN_GAPS} more" if len(gaps) > SHOWN_GAPS else ""
-    return [f"Missing or incomplete: {counted(len(gaps), 'job')}: {'; '.join(named)}{more}."]
+    return [f"Missing or incomplete: {count_of(len(gaps), 'job')}: {'; '.join(named)}{more}."]
