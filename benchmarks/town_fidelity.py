@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roadproof.compositing import composite, view_canvas
+from roadproof.compositing import composite, covered_share, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Observation, Weather
 from roadproof.driving.episode import Episode
@@ -74,17 +74,11 @@ def shoot(
     return episode, Shots(np.stack(frames), np.stack(homographies))
 
 
-def covered(pattern: Pattern, shots: Shots, view: CropResize) -> np.ndarray:
-    """Share of every pixel that a pattern covers, (F, H, W)."""
-    unlit = view_canvas(np.zeros_like(shots.frames), shots.image_from_canvas, view, PLAIN)
-    return composite(replace(pattern, colours=torch.ones_like(pattern.colours)), unlit)[:, 0].numpy()
-
-
 def whole_canvas(shots: Shots, view: CropResize) -> np.ndarray:
     """Pixels that lie wholly on the canvas, (F, H, W)."""
     middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
     everything = Pattern((Shape.RECTANGLE,), torch.tensor([[middle, middle, size, size, 0.0]]), torch.ones(1, 3))
-    return covered(everything, shots, view) > 0.999
+    return covered_share(everything, shots.image_from_canvas, view) > 0.999
 
 
 def in_view(shots: Shots, view: CropResize, every: int) -> np.ndarray:
@@ -121,7 +115,7 @@ def judge(
     paint_px = 0
     for pattern in patterns:
         truth = seen(raster(pattern)).frames.astype(float)
-        paint = covered(pattern, bare, view) >= 0.5
+        paint = covered_share(pattern, bare.image_from_canvas, view) >= 0.5
         paint_px += int(paint.sum())
         for method, (colour, shading) in methods.items():
             for kind in FILTERS:

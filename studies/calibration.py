@@ -29,7 +29,7 @@ from roadproof.calibration.outline import moved
 from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Spread, stated_errors_px
 from roadproof.calibration.two_paint import look_at_paints
-from roadproof.compositing import composite, view_canvas
+from roadproof.compositing import composite, covered_share, view_canvas
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives, Trajectories, Window, record
@@ -37,8 +37,7 @@ from roadproof.geometry import homography_from_pose
 from roadproof.io.files import write_json
 from roadproof.machine import made_with
 from roadproof.patterns import Pattern, raster
-from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recordings import Recording, RecordingSet
+from roadproof.recordings import Recording
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
@@ -65,13 +64,6 @@ def at(recording: Recording, steps: set[int]) -> Recording:
     return replace(recording, maps=maps, **{name: getattr(recording, name)[kept] for name in names})
 
 
-def covered(pattern: Pattern, recording: Recording, recordings: RecordingSet) -> np.ndarray:
-    """Share of every pixel that a pattern covers, (F, H, W)."""
-    plain = ColourTransform(AffineResponse.identity())
-    unlit = view_canvas(np.zeros_like(recording.frames), recording.image_from_canvas, recordings.view, plain)
-    return composite(replace(pattern, colours=torch.ones_like(pattern.colours)), unlit)[:, 0].numpy()
-
-
 def compare(
     results: dict[CalibrationMethod, Calibrated],
     painted: dict[str, list[np.ndarray]],
@@ -89,7 +81,9 @@ def compare(
         exact = at(results[CalibrationMethod.POSE].recordings.recordings[n], common)
         for k, pattern in enumerate(patterns):
             truth = painted[drive.name][k][rows]
-            paint = covered(pattern, exact, results[CalibrationMethod.POSE].recordings) >= 0.5
+            paint = (
+                covered_share(pattern, exact.image_from_canvas, results[CalibrationMethod.POSE].recordings.view) >= 0.5
+            )
             for method, result in results.items():
                 one = at(result.recordings.recordings[n], common)
                 colour, view = result.recordings.colour, result.recordings.view

@@ -14,15 +14,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.variation import Looks
-from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews, fuses
+from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews, fuses, view_canvas
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
+from roadproof.geometry import CameraModel, CropResize
+from roadproof.homographies import Homographies
 from roadproof.patterns import Pattern, coverages, visibilities
+from roadproof.photometry import AffineResponse, ColourTransform
 
 
 def composite(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b f 3 h w"]:
@@ -41,6 +45,26 @@ def composite(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b f 3 h w"]
     flat = Pattern(pattern.shapes, pattern.boxes.reshape(-1, figures, 5), pattern.colours.reshape(-1, figures, 3))
     frames = Compositor([view], len(flat.boxes))([flat])
     return frames.view(*batch, *view.clean_frames.shape)
+
+
+def covered_share(
+    pattern: Pattern, image_from_canvas: Homographies, view: CropResize, *, camera: CameraModel | None = None
+) -> Float[np.ndarray, "f h w"]:
+    """Share of every pixel that a pattern covers, in [0, 1]: what is white on a black road is paint.
+
+    Args:
+        pattern: one pattern, whatever its colours.
+        image_from_canvas: one homography per frame, canvas px to camera px.
+        view: crop and resize that made the frames from the camera picture.
+        camera: camera of the frames, of which only the lens counts; None for a pinhole.
+
+    Raises:
+        GeometryError: no frame shows the canvas.
+    """
+    black = np.zeros((len(image_from_canvas), view.height_px, view.width_px, 3), np.uint8)
+    dark = view_canvas(black, image_from_canvas, view, ColourTransform(AffineResponse.identity()), camera=camera)
+    white = Pattern(pattern.shapes, pattern.boxes, torch.ones_like(pattern.colours))
+    return composite(white, dark)[:, 0].numpy()
 
 
 class Compositor:

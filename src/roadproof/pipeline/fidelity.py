@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from roadproof.attacks import show_pattern
 from roadproof.attacks.groups import Direction, Group
-from roadproof.compositing import composite, view_canvas
+from roadproof.compositing import covered_share
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.datatypes import Weather
@@ -21,7 +21,6 @@ from roadproof.driving.rollout import look_again, rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern, raster
-from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.scenarios import Scenario
@@ -224,12 +223,8 @@ def is_drive_of(recorded: Recording, episode: Episode) -> bool:
 
 
 def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) -> Bool[np.ndarray, "f h w"]:
-    """Pixels of which the pattern covers at least half: a white pattern on a black road says so."""
-    plain = ColourTransform(AffineResponse.identity())
-    black, camera = np.zeros_like(recorded.frames), recordings.camera
-    dark = view_canvas(black, recorded.image_from_canvas, recordings.view, plain, camera=camera)
-    white = Pattern(pattern.shapes, pattern.boxes, torch.ones_like(pattern.colours))
-    return composite(white, dark)[:, 0].numpy() >= 0.5
+    """Pixels of which the pattern covers at least half."""
+    return covered_share(pattern, recorded.image_from_canvas, recordings.view, camera=recordings.camera) >= 0.5
 
 
 def agreement(
