@@ -55,7 +55,7 @@ def drive(
     who: AnyDriver = options.driver_of(driver, device)
 
     # Matplotlib draws the film's map.
-    from roadproof.report.video import film_drive, length_m
+    from roadproof.report.drive_film import film_drive, length_m
 
     with where.open() as (world, driven), film_drive(out / "drive.mp4", world, driven, paint) as film:
         gone_m, whole_m = 0.0, round(length_m(world, driven))

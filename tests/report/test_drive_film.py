@@ -11,7 +11,7 @@ pytest.importorskip("av", reason="films need the extra roadproof[video]")
 import av
 
 from roadproof.io.video import film_file
-from roadproof.report.video import ABOVE_PX, SIZE, DriveView
+from roadproof.report.drive_film import ABOVE_PX, SIZE, DriveView
 from roadproof.roads.maps import load_map, scenario_route
 
 SCENARIO = builtin_scenarios()[0]
