@@ -231,7 +231,10 @@ def test_a_drive_that_ends_on_the_canvas_says_so(drives, town):
 
 
 def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_one(town, tmp_path):
-    nowhere = dataclasses.replace(LEFT, map_name="nope")
-    with pytest.raises(ScenarioError, match="nope"):
-        record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
-    assert not (tmp_path / "record").exists()
+    (tmp_path / "none.xodr").write_text("mine")
+    for name in ("nope", str(tmp_path / "nope.xodr"), str(tmp_path / "none.xodr")):
+        nowhere = dataclasses.replace(LEFT, map_name=name)
+        with pytest.raises(ScenarioError, match="nope|none"):
+            record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
+        assert not (tmp_path / "record").exists()
+    assert (tmp_path / "none.xodr").read_text() == "mine"

@@ -23,7 +23,7 @@ from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Traject
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.io.files import AnyPath, as_path, check_closed, inside, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, check_closed, inside, is_plain_name, write_folder_atomically
 from roadproof.io.html import table
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
@@ -221,9 +221,12 @@ def write_settings(settings: Settings, folder: Path) -> bool:
 
 def forget_settings(folder: Path) -> None:
     """Take the settings of a recording away again, of which no drive could be made, and its folder if it is empty."""
-    if (name := read_settings(folder).scenario.map_name).endswith(MAP):
-        Path(name).unlink(missing_ok=True)
-    (folder / "record.json").unlink(missing_ok=True)
+    path = folder / "record.json"
+    name = _SETTINGS.read(path).scenario.map_name
+    # Where there was no such file, none was copied.
+    if name.endswith(MAP) and is_plain_name(name):
+        (folder / name).unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()
 
