@@ -2,11 +2,13 @@
 
     python studies/judge_again.py --controller CONTROLLER --seed N --json OUT --keep FOLDER
         [--budget full] [--scenarios studies/scenarios/second-town.toml] [--streets right-11]
+        [--weathers cloudy-noon rainy-noon clear-sunset]
 
 Each of the twelve streets that `studies/harden.py` judges on, or of any others that it does not train on, is attacked
 afresh with the searches of its judging: by gradient, by a black box and with ellipses. With the seed of a hardening
 these are its searches and starts, with any other one fresh ones. What was found against another controller before is
-not driven over. FOLDER keeps everything, and an interrupted study goes on there.
+not driven over. What was found is driven over in other weathers too, from the same starts, where these are given.
+FOLDER keeps everything, and an interrupted study goes on there.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from pathlib import Path
 from harden import CROSSINGS, JUDGE_ON, TRAIN_ON, in_words, streets
 from roadproof.cli.progress import stages
 from roadproof.controllers.loading import files_digest
+from roadproof.datatypes import Weather
 from roadproof.errors import CanvasNotReachedError
 from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
 from roadproof.hardening.judgement import JudgedAttack, StreetJudge, most_out_of, strongest_of
@@ -40,6 +43,7 @@ def main() -> None:
     parser.add_argument("--budget", choices=HARDENING_BUDGETS, default="quick", help="of the judging; default quick")
     parser.add_argument("--scenarios", type=Path, help="TOML file of scenarios; by default the built-in ones")
     parser.add_argument("--streets", nargs="+", help="names; by default all of the file, or harden.py's held-out ones")
+    parser.add_argument("--weathers", nargs="+", type=Weather, default=(), help="others in which to drive over it")
     given = parser.parse_args()
     learnt = [*streets(TRAIN_ON), *load_scenarios(CROSSINGS)]
     own = load_scenarios(given.scenarios) if given.scenarios else None
@@ -57,27 +61,38 @@ def main() -> None:
     weights = files_digest(given.controller)
     keep_freed_memory()
     judged: list[JudgedAttack] = []
+    elsewhere: list[JudgedAttack] = []
     unjudged: dict[str, str] = {}
     with open_simulator("town") as town, stages() as show:
         for street in asked:
             try:
-                judged += StreetJudge(plan, town, 0, street, show).judge()
+                judge = StreetJudge(plan, town, 0, street, show)
+                judged += judge.judge()
+                elsewhere += judge.judge_in(given.weathers) if given.weathers else []
             except CanvasNotReachedError as reason:
                 unjudged[street.name] = str(reason)
-    rows = [{key: value for key, value in asdict(each).items() if key != "after"} for each in judged]
     found = {
         "made_with": made_with(),
         "controller": given.controller,
         "weights": weights,
         "seed": given.seed,
         "budget": given.budget,
-        "judged": plain(rows),
+        "judged": rows(judged),
+        "weathers": list(given.weathers),
+        "judged_there": rows(elsewhere),
         "unjudged": unjudged,
     }
     write_json(given.json, found)
     print(table(judged))
+    if elsewhere:
+        print(f"In {', '.join(given.weathers)}:\n{table(elsewhere)}")
     for name, reason in unjudged.items():
         print(f"{name} could not be judged: {reason}")
+
+
+def rows(judged: list[JudgedAttack]) -> object:
+    """What was judged, for JSON: one controller, neither before nor after."""
+    return plain([{key: value for key, value in asdict(each).items() if key != "after"} for each in judged])
 
 
 def table(judged: list[JudgedAttack]) -> str:
@@ -85,13 +100,13 @@ def table(judged: list[JudgedAttack]) -> str:
     kinds = {each.kind: [one for one in judged if one.kind == each.kind] for each in judged}
     on_street = {each.scenario: [one for one in judged if one.scenario == each.scenario] for each in judged}
     strongest = [strongest_of(each) for each in on_street.values()]
-    rows = [f"| {kind} | {in_words(each)} |" for kind, each in {**kinds, "strongest on each street": strongest}.items()]
+    told = [f"| {kind} | {in_words(each)} |" for kind, each in {**kinds, "strongest on each street": strongest}.items()]
     left = [out for each in on_street.values() for out in most_out_of(each)]
     head = ["| kind of attack | median (range) | leaves its lane |", "|---|---|---|"]
-    told = f"Leaves its lane in {sum(left)} of {len(left)} drives."
+    last = f"Leaves its lane in {sum(left)} of {len(left)} drives."
     if lost := sum(each.left_out for each in judged):
-        told += f" In {lost} more of all kinds it never came to the canvas."
-    return "\n".join([*head, *rows, "", told])
+        last += f" In {lost} more of all kinds it never came to the canvas."
+    return "\n".join([*head, *told, "", last])
 
 
 if __name__ == "__main__":

@@ -234,7 +234,7 @@ def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_o
     (tmp_path / "none.xodr").write_text("mine")
     for name in ("nope", str(tmp_path / "nope.xodr"), str(tmp_path / "none.xodr")):
         nowhere = dataclasses.replace(LEFT, map_name=name)
-        with pytest.raises(ScenarioError, match="nope|none"):
+        with pytest.raises(ScenarioError, match=r"nope|none"):
             record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
         assert not (tmp_path / "record").exists()
     assert (tmp_path / "none.xodr").read_text() == "mine"

@@ -145,6 +145,11 @@ def test_one_that_no_longer_drives_a_street_for_judging_is_told_with_the_reason(
     far = street(tmp_path, "far", 25.0)
     before = stages_of(plan, town).judge_before([near, far])
     assert {each.after for each in before} == {False}
+    # What was found there is driven over in the rain from the same starts.
+    rain = StreetJudge(plan, town, 0, near, lambda *_: None).judge_in([Weather.RAINY_NOON])
+    at_noon = [each for each in before if each.scenario == "near"]
+    assert [(each.kind, each.starts) for each in rain] == [(each.kind, each.starts) for each in at_noon]
+    assert [each.deviation_m for each in rain] != [each.deviation_m for each in at_noon]
     judged, unjudged = stages_of(plan, town, processes=2).judge(1, [near, far])
     assert (judged, list(unjudged)) == ((), ["near", "far"])
     assert stages_of(plan, town).judge(1, [near, far]) == (judged, unjudged)

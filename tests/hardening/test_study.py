@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import needs
+from roadproof.datatypes import Weather
 from roadproof.errors import CanvasNotReachedError, TrainingError
 from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
 from roadproof.hardening.judgement import StreetJudge
@@ -91,13 +92,26 @@ def test_the_study_of_other_seeds_counts_the_attack_that_leads_most_drives_out(j
             raise CanvasNotReachedError("it stops before the canvas")
         return [far, often]
 
+    def judge_in(self, weathers):
+        assert weathers == [Weather.RAINY_NOON]
+        return [replace(often, scenario=self.scenario.name, deviation_m=(0.1, 0.3), left_lane=(False, False))]
+
     monkeypatch.setattr(StreetJudge, "judge", judge)
-    found = judge_again("--streets", "left-03", "left-05", "--seed", "3", "--budget", "full")
+    monkeypatch.setattr(StreetJudge, "judge_in", judge_in)
+    asked = ("--streets", "left-03", "left-05", "--seed", "3", "--budget", "full")
+    assert judge_again(*asked)["judged_there"] == []
+    capfd.readouterr()
+    found = judge_again(*asked, "--weathers", "rainy-noon")
+    assert found["weathers"] == ["rainy-noon"]
+    (there,) = found["judged_there"]
+    assert (there["scenario"], there["deviation_m"]) == ("left-03", [0.1, 0.3])
     assert (found["controller"], found["seed"], found["budget"]) == ("pilotnet", 3, "full")
     assert found["unjudged"] == {"left-05": "it stops before the canvas"}
     assert [each["kind"] for each in found["judged"]] == ["by gradient", "random"]
     assert all("after" not in each for each in found["judged"])
     assert "| strongest on each street | 1.20 m (1.20–1.20) | 50% |" in (said := capfd.readouterr().out)
+    assert "In rainy-noon:\n| kind of attack |" in said
+    assert "| random | 0.20 m (0.20–0.20) | 0% |" in said
     assert "Leaves its lane in 2 of 2 drives. In 1 more of all kinds it never came to the canvas." in said
     assert "left-05 could not be judged: it stops before the canvas" in said
 

@@ -298,7 +298,25 @@ class StreetJudge:
             judged.append(self._driven(controller, old, folder / "old", OLD))
         return judged
 
-    def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> JudgedAttack:
+    def judge_in(self, weathers: Sequence[Weather]) -> list[JudgedAttack]:
+        """Drive over what `judge` found, the strongest of each kind, in other weathers and from the same starts.
+
+        Raises:
+            RoadproofError: `judge` has not been here, or a drive fails.
+        """
+        plan, folder = self.plan, self.plan.judged(self.number, self.scenario)
+        found = {plan.budget.searched: folder / "pattern.json"}
+        for number, kind in enumerate(plan.budget.kinds(plan.space), 1):
+            found[kind] = folder / f"kind-{number}" / "attack" / "pattern.json"
+        controller = plan.controller(self.number)
+        return [
+            self._driven(controller, load_pattern(path), path.parent / "elsewhere", kind, weathers)
+            for kind, path in found.items()
+        ]
+
+    def _driven(
+        self, controller: Controller, pattern: Pattern, place: Path, kind: str, weathers: Sequence[Weather] = ()
+    ) -> JudgedAttack:
         asked = self.plan.budget.judge
         evaluation = evaluate(
             self.simulator,
@@ -307,7 +325,7 @@ class StreetJudge:
             pattern,
             folder=place,
             driver_name=self.plan.name(self.number),
-            weathers=asked.weathers,
+            weathers=weathers or asked.weathers,
             starts=asked.starts,
             start_range=asked.start_range,
             runs=asked.runs,
