@@ -66,11 +66,12 @@ def main() -> None:
     with open_simulator("town") as town, stages() as show:
         for street in asked:
             try:
-                judge = StreetJudge(plan, town, 0, street, show)
-                judged += judge.judge()
-                elsewhere += judge.judge_in(given.weathers) if given.weathers else []
+                judged += StreetJudge(plan, town, 0, street, show).judge()
             except CanvasNotReachedError as reason:
                 unjudged[street.name] = str(reason)
+                continue
+            if given.weathers:
+                elsewhere += StreetJudge(plan, town, 0, street, show).judge_in(given.weathers)
     found = {
         "made_with": made_with(),
         "controller": given.controller,

@@ -84,8 +84,22 @@ def test_a_recording_knows_a_map_by_what_is_in_it_wherever_it_lies(drives, tmp_p
     with pytest.raises(RecordingError, match=r"own\.xodr has changed since the drives in .*record were recorded on it"):
         require_same_map(stored, tmp_path / "record")
     own.unlink()
-    with pytest.raises(RecordingError, match=r"record lacks own\.xodr, the map of its scenario; put it back"):
+    with pytest.raises(RecordingError, match=r"record lacks own\.xodr, the map of its scenario; give the same"):
         read_settings(tmp_path / "record")
+    # Which copies it there again, also where an older recording names one that lies elsewhere.
+    kept.write_text("<OpenDRIVE/>")
+    file = tmp_path / "record" / "record.json"
+    for stated in (file.read_text(), file.read_text().replace('"own.xodr"', json.dumps(str(kept)))):
+        file.write_text(stated)
+        assert not write_settings(settings, tmp_path / "record")
+        assert read_settings(tmp_path / "record") == stored
+        assert own.read_text() == "<OpenDRIVE/>"
+        own.unlink()
+
+
+def test_a_map_that_is_named_by_its_path_in_the_simulator_is_the_same_again(drives, tmp_path):
+    settings = dataclasses.replace(drives.settings, scenario=dataclasses.replace(LEFT, map_name="Carla/Maps/Town01"))
+    assert [write_settings(settings, tmp_path / "record") for _ in range(2)] == [True, False]
 
 
 @pytest.mark.parametrize("name", ["../own.xodr", "/etc/own.xodr", "deep/own.xodr"])
@@ -96,7 +110,7 @@ def test_a_map_that_lies_elsewhere_is_no_recordings(drives, tmp_path, name):
         write_settings(settings, tmp_path / "record")
     stated = tmp_path / "record" / "record.json"
     stated.write_text(stated.read_text().replace('"own.xodr"', json.dumps(name)))
-    with pytest.raises(RecordingError, match=r"record\.json: map_name '.*own\.xodr' is not a plain name"):
+    with pytest.raises(RecordingError, match=r"record\.json: map_name is '.*own\.xodr', expected the name of a"):
         read_settings(tmp_path / "record")
 
 
@@ -238,3 +252,9 @@ def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_o
             record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
         assert not (tmp_path / "record").exists()
     assert (tmp_path / "none.xodr").read_text() == "mine"
+    own = tmp_path / "record" / "own.xodr"
+    own.parent.mkdir()
+    own.write_text("mine")
+    with pytest.raises(ScenarioError, match="own"):
+        record(town, expert, dataclasses.replace(LEFT, map_name=str(own)), folder=own.parent, **ASKED)
+    assert [path.name for path in own.parent.iterdir()] == ["own.xodr"]

@@ -29,7 +29,7 @@ from roadproof.hardening.result import Round, best_of
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import Tuning, training_step
 from roadproof.paint import PaintLimits
-from roadproof.pipeline.stage_costs import Ledger
+from roadproof.pipeline.stage_costs import Ledger, read_cost
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.training.shards import Shard
@@ -322,6 +322,7 @@ def check_result(found, out):
     assert list(found.cost) == ["town", "attack", "learn", "bare road", "judge"]
     assert found.cost["learn"].seconds > 0
     assert found.cost["judge"].simulator_calls == sum(each.simulator_calls for each in judged) > 4 * len(judged)
+    assert read_cost(out)["judge"] == found.cost["judge"], "told to whoever goes on, too"
     assert not (out / "round-1" / "learning.safetensors").exists()
     stored = json.loads((out / "hardening.json").read_text())
     assert stored["hardened"] == found.hardened

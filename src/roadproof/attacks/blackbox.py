@@ -146,9 +146,6 @@ class BayesianOptimisation(BlackBox):
     Args:
         random_calls: number of the calls that are drawn at random before the model guides the rest; 0 takes two
             fifths, as published 400 of 1,000.
-
-    Raises:
-        RoadproofError: a number is too small, or no call is left for the model.
     """
 
     word: ClassVar[str] = "published-bo"
@@ -161,11 +158,16 @@ class BayesianOptimisation(BlackBox):
         if self.random_calls == 0:
             object.__setattr__(self, "random_calls", max(1, self.calls * 2 // 5))
         at_least_one(self, "random_calls")
-        if self.random_calls >= self.calls:
-            raise RoadproofError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
 
     def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
-        """The paper's Bayesian optimisation, on parameters in natural units (px, degrees, colour levels)."""
+        """The paper's Bayesian optimisation, on parameters in natural units (px, degrees, colour levels).
+
+        Raises:
+            RoadproofError: no call is left for the model.
+        """
+        # Not where it is made: results of such searches, which were all random, are still read.
+        if self.random_calls >= self.calls > 1:
+            raise RoadproofError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         return proposals.published_bo(proposals.natural_ranges(space), self.random_calls, seed)
 
 
@@ -246,7 +248,7 @@ def blackbox_search(
         )
     given = None if first is None else cast("list[Any]", first.tolist())
     propose = method.proposer_after(len(given or ()), space, seed)
-    # More calls are the same search, gone on with.
+    # More calls are the same search, gone on with, unless more are drawn at random for them.
     settings = {name: each for name, each in asdict(method).items() if name != "calls"}
     identity = repr((space, method.word, settings, seed, at_once, given, world))
     keeping = Checkpoint(checkpoint, identity, aim)

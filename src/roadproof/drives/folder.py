@@ -203,7 +203,8 @@ def write_settings(settings: Settings, folder: Path) -> bool:
     if path.exists():
         content = _SETTINGS.content(path)
         _SETTINGS.made(path, content)  # damage is named as such
-        known = content["scenario"] | {"map": content.get("map", "")}
+        stored = content["scenario"]["map_name"]
+        known = content["scenario"] | {"map_name": Path(stored).name, "map": content.get("map", "")}
         if known["map"] and known["map"] == scenario["map"]:
             # The same road, whatever its file is called.
             scenario["map_name"] = known["map_name"]
@@ -211,20 +212,30 @@ def write_settings(settings: Settings, folder: Path) -> bool:
         before = {"world": ""} | content | {"scenario": known}
         now = _SETTINGS.stated(settings) | {"scenario": scenario}
         require_same(folder, "a recording", before, now, RecordingError)
+        # Older recordings name a map that lies elsewhere; and a copy may be lost.
+        if scenario["map"] and not (is_plain_name(stored) and (folder / stored).is_file()):
+            _write(settings, folder, scenario["map"])
         return False
-    if scenario["map"]:
-        own = with_map_in(folder, settings.scenario)
-        settings = replace(settings, scenario=replace(own, map_name=Path(own.map_name).name))
-    _SETTINGS.write(path, settings, **({"map": scenario["map"]} if scenario["map"] else {}))
+    _write(settings, folder, scenario["map"])
     return True
 
 
-def forget_settings(folder: Path) -> None:
+def _write(settings: Settings, folder: Path, digest_of_map: str) -> None:
+    """Write record.json, and the scenario's map beside it where that is a file."""
+    told: dict[str, str] = {}
+    if digest_of_map:
+        own = with_map_in(folder, settings.scenario)
+        settings = replace(settings, scenario=replace(own, map_name=Path(own.map_name).name))
+        told["map"] = digest_of_map
+    _SETTINGS.write(folder / "record.json", settings, **told)
+
+
+def forget_settings(settings: Settings, folder: Path) -> None:
     """Take the settings of a recording away again, of which no drive could be made, and its folder if it is empty."""
-    path = folder / "record.json"
+    path, own = folder / "record.json", Path(settings.scenario.map_name)
     name = _SETTINGS.read(path).scenario.map_name
-    # Where there was no such file, none was copied.
-    if name.endswith(MAP) and is_plain_name(name):
+    # What lay there before was not copied, and stays; where there was no such file, none was.
+    if own.suffix == MAP and own.resolve().parent != folder.resolve() and is_plain_name(name):
         (folder / name).unlink(missing_ok=True)
     path.unlink(missing_ok=True)
     with suppress(OSError):
@@ -271,9 +282,12 @@ def read_settings(folder: Path) -> Settings:
     settings = _SETTINGS.read(path)
     if not settings.scenario.map_name.endswith(MAP):
         return settings
-    own = inside(folder, settings.scenario.map_name, f"{path}: map_name", RecordingError)
+    name, cure = settings.scenario.map_name, "give the same `roadproof record` again, which copies it there"
+    if not is_plain_name(name):
+        raise RecordingError(f"{path}: map_name is {name!r:.120}, expected the name of a file beside it; {cure}")
+    own = inside(folder, name, f"{path}: map_name", RecordingError)
     if not own.is_file():
-        raise RecordingError(f"{folder} lacks {own.name}, the map of its scenario; put it back, or record again")
+        raise RecordingError(f"{folder} lacks {own.name}, the map of its scenario; {cure}")
     return replace(settings, scenario=replace(settings.scenario, map_name=str(own.resolve())))
 
 

@@ -111,7 +111,7 @@ def record(
         except RoadproofError:
             if began and folder is not None:
                 # A scenario that the simulator refuses can be mended, and recorded here.
-                forget_settings(folder)
+                forget_settings(settings, folder)
             raise
         astray = partial(_perturbed, driver, settings, done[plans[0].name])
         for _, drive in driving.each(astray, [plan for plan in plans if plan.name not in done]):

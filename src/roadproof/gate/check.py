@@ -43,9 +43,9 @@ from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.recordings import evenly
 from roadproof.roads.marks import site_at
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator, begun_in
+from roadproof.simulators.protocol import Simulator, begun_in, world_of
 
 JUNIT, SUMMARY = "junit.xml", "summary.md"
 PATTERNS, DRIVES = "patterns", "drives"
@@ -274,10 +274,11 @@ class _Check:
         return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
 
     def _attacked(self, world: Simulator, scenario: Scenario, seed: int) -> StressTest:
-        """A fresh attack; its folder is this controller's and this plan's own."""
+        """A fresh attack; its folder is that of this very attack alone."""
         plan, space = self.plan, SearchSpace(figures=self.plan.figures, limits=self.plan.paint)
         who = identity_of(self.controller, (world.input.height_px, world.input.width_px))
-        asked = digest(stated(known_by([who, plan.controller, plan.attack, space])))
+        place = identity(scenario), world_of(world), world.paint
+        asked = digest(stated(known_by([who, plan.controller, plan.attack, space, *place])))
         return stress_test(
             world,
             self.controller,

@@ -99,6 +99,7 @@ class Ledger:
     def calls(self, name: str, simulator_calls: int) -> None:
         """Record how many drives a stage took since the run began."""
         self.cost[name] = replace(self.cost[name], simulator_calls=simulator_calls)
+        self._write()
 
     def _note(self) -> None:
         now = time.perf_counter()

@@ -152,7 +152,7 @@ def of_proposals(method: Method, *, at_once: int = 1) -> Workload:
     if isinstance(method, TPE):
         return Workload(seconds=TOLD_S * method.calls**2 / (2 * at_once))
     if isinstance(method, BayesianOptimisation):
-        first, (each_s, later_s) = method.random_calls, PUBLISHED_S
+        first, (each_s, later_s) = min(method.random_calls, method.calls), PUBLISHED_S
     elif isinstance(method, GaussianProcess):
         first, (each_s, later_s) = 0, PROCESS_S
         later_s *= FURTHER + (1 - FURTHER) / at_once

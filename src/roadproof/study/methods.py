@@ -103,8 +103,11 @@ class BlackBoxPlan:
 
     def __post_init__(self) -> None:
         budget_of(self, Weather.CLEAR_NOON)
-        if self.search != BayesianOptimisation.word and self.random_calls != RANDOM_CALLS:
+        guided = self.search == BayesianOptimisation.word
+        if not guided and self.random_calls != RANDOM_CALLS:
             raise StudyError(f"random_calls is {self.random_calls}, which search {self.search} has not; leave it out")
+        if guided and self.random_calls >= self.calls:
+            raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and self.where == "recorded":
             raise StudyError(f"start is {self.start} with where recorded; expected 0, or where simulator")
 
