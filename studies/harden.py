@@ -1,7 +1,7 @@
 """Does hardening help on held-out streets?
 
     python studies/harden.py --json OUT --keep FOLDER [--controller cil] [--budget full] [--steps 1500] [--rounds 2]
-        [--processes N]
+        [--weathers clear-noon rainy-noon] [--processes N]
 
 A controller is hardened on 26 streets, thirteen of the built-in scenarios and thirteen crossings, and judged on twelve
 other built-in scenarios, four of each kind, on other streets: attacked afresh as in training, by a black box and with
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from roadproof.cli.progress import stages
+from roadproof.datatypes import Weather
 from roadproof.hardening import Hardened, harden, write_hardening
 from roadproof.hardening.budget import HARDENING_BUDGETS
 from roadproof.hardening.judgement import JudgedAttack
@@ -48,10 +49,11 @@ def main() -> None:
     parser.add_argument("--budget", choices=HARDENING_BUDGETS, default="quick")
     parser.add_argument("--steps", type=int, help="batches of a tuning; by default the budget's")
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--weathers", nargs="+", type=Weather, default=[Weather.CLEAR_NOON], help="of all attacks")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=1, help="streets attacked at once")
     given = parser.parse_args()
-    budget = HARDENING_BUDGETS[given.budget]
+    budget = HARDENING_BUDGETS[given.budget].in_weathers(tuple(given.weathers))
     if given.steps is not None:
         budget = replace(budget, tuning=replace(budget.tuning, steps=given.steps))
     keep_freed_memory()

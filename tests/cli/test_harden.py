@@ -49,6 +49,16 @@ def test_the_estimate_counts_the_drives_over_the_bare_road_that_are_asked_for(in
     assert all_forty - usual == 2 * 4 * (40 - 2)
 
 
+def test_the_estimate_counts_what_each_weather_takes(invoke, monkeypatch):
+    monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda _, gradients=True: 0.01)
+    asked = ("harden", "pilotnet", "--train-on", "left-07", "--judge-on", "straight-04", "--dry-run", "--json")
+    seconds = [
+        json.loads(invoke(*asked, "--weathers", weathers)[1].out)["seconds"]
+        for weathers in ("clear-noon", "clear-noon,rainy-noon")
+    ]
+    assert 1.3 < seconds[1] / seconds[0] < 2.0
+
+
 def test_the_estimate_counts_drives_through_the_town_where_they_are_made(invoke):
     asked = ("harden", "pilotnet", "--train-on", "left-07", "--rounds", "1", "--dry-run", "--json", "--simulator")
     worlds = ("town", "town:egl", "carla://localhost:2000")

@@ -7,6 +7,7 @@ import torch
 
 from roadproof.attacks import RandomSearch, SteeringShift
 from roadproof.coverage import Shape
+from roadproof.datatypes import Weather
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, by_street, check_streets
 from roadproof.paint import LaneMark, PaintLimits, Site
@@ -74,6 +75,21 @@ def test_training_can_paint_what_attacks_find_clear_of_lane_marks(family):
     torch.testing.assert_close(again.boxes[paints], found.boxes[paints], atol=0.01, rtol=1e-4)
     assert not learnt.is_limited
     assert learnt not in others
+
+
+def test_weathers_are_those_of_attacks_and_of_what_judges_them():
+    noon, rain = Weather.CLEAR_NOON, Weather.RAINY_NOON
+    for budget in HARDENING_BUDGETS.values():
+        assert budget.in_weathers((noon,)) == budget
+        both = budget.in_weathers((noon, rain))
+        assert both.attack.recorded_in == both.judge.recorded_in == both.attack.weathers == (noon, rain)
+        assert set(both.judge.weathers) == {
+            noon,
+            rain,
+            *(budget.judge.weathers if len(budget.judge.weathers) > 1 else ()),
+        }
+        wet = budget.in_weathers((rain,))
+        assert wet.attack.recorded_in == wet.judge.recorded_in == wet.judge.weathers[:1] == (rain,)
 
 
 def test_judging_paints_in_other_shapes_what_else_the_space_allows():

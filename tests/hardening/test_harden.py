@@ -28,6 +28,7 @@ from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round, best_of
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import Tuning, training_step
+from roadproof.hardening.views import Street
 from roadproof.paint import PaintLimits
 from roadproof.pipeline.stage_costs import Ledger, read_cost
 from roadproof.scenarios import Scenario
@@ -175,6 +176,26 @@ def test_weights_that_are_not_judged_yet_do_not_replace_those_that_are(town, tmp
         run(town, out, rounds=2, on_progress=stop)
     assert (out / "round-2" / "hardened.safetensors").exists()
     assert (out / "hardened.safetensors").read_bytes() == kept
+
+
+@pytest.mark.slow
+def test_hardening_in_two_weathers_attacks_learns_and_judges_in_both(town, tmp_path, monkeypatch):
+    learnt = list[str]()
+
+    class Noted(Street):
+        def __init__(self, recordings, *given, **named):
+            learnt.extend({each.weather for each in recordings.recordings})
+            super().__init__(recordings, *given, **named)
+
+    monkeypatch.setattr("roadproof.hardening.stages.Street", Noted)
+    found = run(town, tmp_path / "out", budget=TINY.in_weathers((Weather.CLEAR_NOON, Weather.RAINY_NOON)))
+    near = tmp_path / "out" / "round-0" / "near"
+    assert all((near / place / "recordings").is_dir() for place in ("", "rainy-noon"))
+    assert learnt == ["clear-noon", "rainy-noon"]
+    assert {len(each.deviation_m) for each in found.judgement.judged} == {2 * 2}
+    assert {len(each.by_start()) for each in found.judgement.judged} == {2}
+    with pytest.raises(RoadproofError, match="holds a hardening with budget"):
+        run(town, tmp_path / "out")
 
 
 def test_a_file_that_is_damaged_is_no_verdict(town, tmp_path, monkeypatch):

@@ -34,6 +34,13 @@ def harden(
     scenarios: options.ScenarioFile = None,
     rounds: Annotated[int, number("Rounds of attack, tuning and re-test.", 1, 100)] = 2,
     budget: Annotated[str, typer.Option(help="quick, or full: ten times the tuning; see --dry-run.")] = "quick",
+    weathers: Annotated[
+        str,
+        typer.Option(
+            help="Weathers, with commas between, in which it is attacked, learns and is judged.",
+            autocompletion=options.weather_names,
+        ),
+    ] = "clear-noon",
     training_step: Annotated[
         str | None, unset("module:function(model, batch) that gives the loss, where the usual does not fit.")
     ] = None,
@@ -64,6 +71,7 @@ def harden(
         return [find_scenario(name.strip(), known) for name in names.split(",") if name.strip()]
 
     spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
+    spent = spent.in_weathers(options.weathers_of(weathers, "weathers"))
     training, judging = named(train_on), named(judge_on)
     if clean_on and not judging:
         raise RoadproofError("--clean-on is driven where the result is judged; give --judge-on too, or leave it out")
@@ -121,8 +129,9 @@ def _workload(
     whole += learnt.times(rounds)
     if judging:
         judge = budget.judge
-        found = of_search(budget.unseen, judge.objective, 0, who)
-        again = of_search(judge.method, judge.objective, judge.window.frames, who)
+        skies = len(judge.recorded_in)
+        found = of_search(budget.unseen, judge.objective, 0, who).times(skies)
+        again = of_search(judge.method, judge.objective, judge.window.frames, who).times(skies)
         driven = of_evaluation(len(judge.weathers), judge.starts, judge.runs, film=False)
         before = of_run(judge, who, film=False) + found + again + driven.times(2)
         # The one after also drives over what was found against the one before.

@@ -67,6 +67,21 @@ class HardeningBudget:
         )
         return replace(self, attack=attack, judge=judge)
 
+    def in_weathers(self, weathers: tuple[Weather, ...]) -> HardeningBudget:
+        """The same budget with attacks, learning and judging in the mean over these weathers.
+
+        A budget whose patterns are driven over in several weathers, when they are judged, still does so in those.
+        """
+        attack, judge = (
+            replace(
+                each,
+                weathers=tuple(dict.fromkeys((*weathers, *(each.weathers if len(each.weathers) > 1 else ())))),
+                attack_weathers=weathers if len(weathers) > 1 else (),
+            )
+            for each in (self.attack, self.judge)
+        )
+        return replace(self, attack=attack, judge=judge)
+
     def require_libraries(self, space: SearchSpace) -> None:
         """See that what judging needs is installed.
 

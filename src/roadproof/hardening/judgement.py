@@ -28,8 +28,7 @@ from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import StartOffset
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.patterns import Pattern, load_pattern
-from roadproof.pipeline.stress_test import OnProgress
-from roadproof.recordings import load_recordings
+from roadproof.pipeline.stages import OnProgress, recordings_of
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -275,7 +274,7 @@ class StreetJudge:
         tested = plan.attack(self.simulator, self.number, self.scenario, self.on_progress, judging=True)
         calls = sum(cost.simulator_calls for cost in tested.cost.values())
         judged = [self._judged(tested.evaluation, plan.budget.searched, calls)]
-        controller, recordings = plan.controller(self.number), load_recordings(folder / "recordings")
+        controller, recordings = plan.controller(self.number), recordings_of(folder, plan.budget.judge)
         for number, (kind, (method, space)) in enumerate(plan.budget.kinds(plan.space).items(), 1):
             place = folder / f"kind-{number}"
             title, steps = f"Searching, {kind}", method.steps(plan.budget.judge.objective)

@@ -29,9 +29,9 @@ from roadproof.io.identity import stated
 from roadproof.io.known import known_by
 from roadproof.machine import give_back_freed_memory
 from roadproof.pipeline.stage_costs import Ledger
+from roadproof.pipeline.stages import recordings_of
 from roadproof.pipeline.stress_test import OnProgress, StressTest
 from roadproof.processes import spread, stopping
-from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 from roadproof.simulators.town.simulator import TownSimulator
@@ -113,11 +113,13 @@ class HardeningStages:
         for past, attacked in enumerate(tests):
             driver = plan.controller(past)
             for scenario, test in zip(plan.scenarios, attacked, strict=True):
-                recordings = load_recordings(plan.round(past) / scenario.name / "recordings")
+                recordings = recordings_of(plan.round(past) / scenario.name, plan.budget.attack)
                 points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
-                street = Street(recordings, self.teacher, device=plan.device)
-                street.add_ways(driver, space.pattern(points.to(plan.device)))
-                streets.append(street)
+                # A recorded world has one light.
+                for each in recordings.by_weather():
+                    street = Street(each, self.teacher, device=plan.device)
+                    street.add_ways(driver, space.pattern(points.to(plan.device)))
+                    streets.append(street)
                 found.append(points)
                 told += [recordings.digest(), points]
         title = f"Round {number}: learning"

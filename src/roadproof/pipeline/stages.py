@@ -29,7 +29,7 @@ from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, best_of, round_folder, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
 from roadproof.processes import Pool
-from roadproof.recordings import RecordingSet
+from roadproof.recordings import RecordingSet, load_recordings, pooled
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
@@ -301,7 +301,23 @@ class Stages:
 
     def _folder_of(self, number: int) -> Path:
         """The folder of the drives in the weather of this number."""
-        return self.folder / self.budget.recorded_in[number] if number else self.folder
+        return _folder_of(self.folder, self.budget, number)
+
+
+def recordings_of(run: Path, budget: Budget) -> RecordingSet:
+    """The recordings that a run of this budget was searched on, in all of its weathers.
+
+    Raises:
+        RecordingError: some are missing or damaged.
+    """
+    places = [_folder_of(run, budget, k) / "recordings" for k in range(len(budget.recorded_in))]
+    if len(places) == 1:
+        return load_recordings(places[0])
+    return pooled({str(each): load_recordings(place) for each, place in zip(budget.recorded_in, places, strict=True)})
+
+
+def _folder_of(run: Path, budget: Budget, number: int) -> Path:
+    return run / budget.recorded_in[number] if number else run
 
 
 def check_street(simulator: Simulator, scenario: Scenario, space: SearchSpace, budget: Budget) -> None:

@@ -236,6 +236,8 @@ def of_recording(budget: Budget, *, processes: int = 1) -> Workload:
 
 def of_finding(budget: Budget, controller: Controller) -> Workload:
     """Estimate the search of a stress test, and the drives over what it finds."""
-    frames = budget.window.frames * (1 + budget.trajectories.count // 2) * len(budget.recorded_in)
-    searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
+    frames, worlds = budget.window.frames * (1 + budget.trajectories.count // 2), len(budget.recorded_in)
+    searched = of_search(budget.method, budget.objective, frames * worlds, controller).times(1 + budget.rounds)
+    # A recorded world has one light.
+    searched = searched.times(worlds) if budget.is_predicted else searched
     return searched + of_drives(budget.select + budget.rounds * (1 + budget.select))
