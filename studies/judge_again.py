@@ -65,13 +65,14 @@ def main() -> None:
     unjudged: dict[str, str] = {}
     with open_simulator("town") as town, stages() as show:
         for street in asked:
+            judge = StreetJudge(plan, town, 0, street, show)
             try:
-                judged += StreetJudge(plan, town, 0, street, show).judge()
+                judged += judge.judge()
             except CanvasNotReachedError as reason:
                 unjudged[street.name] = str(reason)
                 continue
             if given.weathers:
-                elsewhere += StreetJudge(plan, town, 0, street, show).judge_in(given.weathers)
+                elsewhere += judge.judge_in(given.weathers)
     found = {
         "made_with": made_with(),
         "controller": given.controller,

@@ -51,7 +51,9 @@ def test_the_estimate_counts_the_drives_over_the_bare_road_that_are_asked_for(in
 
 def test_the_estimate_counts_what_each_weather_takes(invoke, monkeypatch):
     monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda _, gradients=True: 0.01)
-    asked = ("harden", "pilotnet", "--train-on", "left-07", "--judge-on", "straight-04", "--dry-run", "--json")
+    # On several streets, so that attacks count beside the tuning, which takes as long in any weathers.
+    streets = "left-07,right-06,straight-06,left-11"
+    asked = ("harden", "pilotnet", "--train-on", streets, "--judge-on", "straight-04", "--dry-run", "--json")
     seconds = [
         json.loads(invoke(*asked, "--weathers", weathers)[1].out)["seconds"]
         for weathers in ("clear-noon", "clear-noon,rainy-noon")

@@ -135,7 +135,7 @@ def attack(
     _check_attacked(attacked, drives, goal, by_gradient=by_gradient, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)
-    work = of_search(searched, goal, frames, attacked, groups=len(chosen))
+    work = of_search(searched, goal, frames, attacked, groups=len(chosen), worlds=len(drives.by_weather()))
     less = Workload() if cheapest is None else of_cheapest(space.figures, goal, attacked)
     begin(work.times(searches) + less, out)
     with progress("Searching", searched.steps(goal)) as on_step:

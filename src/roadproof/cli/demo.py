@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from roadproof.cli import options
 from roadproof.cli.options import number
 from roadproof.cli.output import answer, say, stored
@@ -26,13 +24,7 @@ def demo(
     controller: options.ControllerSpec = "pilotnet",
     budget: options.BudgetName = "quick",
     rounds: Annotated[int, number("Rounds of searching on along the way that the attacked car took.", 0, 100)] = 0,
-    attack_weathers: Annotated[
-        str,
-        typer.Option(
-            help="Weathers, with commas between, over which the mean is attacked.",
-            autocompletion=options.weather_names,
-        ),
-    ] = "clear-noon",
+    attack_weathers: Annotated[str, options.several_weathers("over which the mean is attacked")] = "clear-noon",
     figures: options.Figures = 5,
     cheapest: options.CheapestFor = None,
     limit_costs: options.LimitCosts = False,

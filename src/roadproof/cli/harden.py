@@ -34,13 +34,7 @@ def harden(
     scenarios: options.ScenarioFile = None,
     rounds: Annotated[int, number("Rounds of attack, tuning and re-test.", 1, 100)] = 2,
     budget: Annotated[str, typer.Option(help="quick, or full: ten times the tuning; see --dry-run.")] = "quick",
-    weathers: Annotated[
-        str,
-        typer.Option(
-            help="Weathers, with commas between, in which it is attacked, learns and is judged.",
-            autocompletion=options.weather_names,
-        ),
-    ] = "clear-noon",
+    weathers: Annotated[str, options.several_weathers("in which it is attacked, learns and is judged")] = "clear-noon",
     training_step: Annotated[
         str | None, unset("module:function(model, batch) that gives the loss, where the usual does not fit.")
     ] = None,
@@ -129,9 +123,9 @@ def _workload(
     whole += learnt.times(rounds)
     if judging:
         judge = budget.judge
-        skies = len(judge.recorded_in)
-        found = of_search(budget.unseen, judge.objective, 0, who).times(skies)
-        again = of_search(judge.method, judge.objective, judge.window.frames, who).times(skies)
+        worlds = len(judge.recorded_in)
+        found = of_search(budget.unseen, judge.objective, 0, who, worlds=worlds)
+        again = of_search(judge.method, judge.objective, judge.window.frames * worlds, who, worlds=worlds)
         driven = of_evaluation(len(judge.weathers), judge.starts, judge.runs, film=False)
         before = of_run(judge, who, film=False) + found + again + driven.times(2)
         # The one after also drives over what was found against the one before.

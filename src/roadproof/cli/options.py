@@ -71,6 +71,11 @@ def weather_names(begun: str) -> list[str]:
     return [before + comma + weather for weather in Weather if weather.startswith(last)]
 
 
+def several_weathers(about: str) -> Any:  # noqa: ANN401
+    """An option for weathers with commas between (`weathers_of`), in words."""
+    return typer.Option(help=f"Weathers, with commas between, {about}.", autocompletion=weather_names)
+
+
 def argument(about: str) -> Any:  # noqa: ANN401
     """An argument, in words; it must be given where its type has no default."""
     return typer.Argument(help=about, show_default=False)

@@ -275,8 +275,7 @@ class StreetJudge:
         calls = sum(cost.simulator_calls for cost in tested.cost.values())
         judged = [self._judged(tested.evaluation, plan.budget.searched, calls)]
         controller, recordings = plan.controller(self.number), recordings_of(folder, plan.budget.judge)
-        for number, (kind, (method, space)) in enumerate(plan.budget.kinds(plan.space).items(), 1):
-            place = folder / f"kind-{number}"
+        for place, (kind, (method, space)) in zip(self._places(), plan.budget.kinds(plan.space).items(), strict=True):
             title, steps = f"Searching, {kind}", method.steps(plan.budget.judge.objective)
             found = kept_attack(
                 place / "attack",
@@ -303,15 +302,18 @@ class StreetJudge:
         Raises:
             RoadproofError: `judge` has not been here, or a drive fails.
         """
-        plan, folder = self.plan, self.plan.judged(self.number, self.scenario)
-        found = {plan.budget.searched: folder / "pattern.json"}
-        for number, kind in enumerate(plan.budget.kinds(plan.space), 1):
-            found[kind] = folder / f"kind-{number}" / "attack" / "pattern.json"
-        controller = plan.controller(self.number)
+        plan, folders = self.plan, [self.plan.judged(self.number, self.scenario)]
+        folders += [place / "attack" for place in self._places()]
+        controller, kinds = plan.controller(self.number), (plan.budget.searched, *plan.budget.kinds(plan.space))
         return [
-            self._driven(controller, load_pattern(path), path.parent / "elsewhere", kind, weathers)
-            for kind, path in found.items()
+            self._driven(controller, load_pattern(place / "pattern.json"), place / "elsewhere", kind, weathers)
+            for kind, place in zip(kinds, folders, strict=True)
         ]
+
+    def _places(self) -> list[Path]:
+        """The folders of the kinds of attack that training did not use."""
+        folder = self.plan.judged(self.number, self.scenario)
+        return [folder / f"kind-{number}" for number in range(1, 1 + len(self.plan.budget.kinds(self.plan.space)))]
 
     def _driven(
         self, controller: Controller, pattern: Pattern, place: Path, kind: str, weathers: Sequence[Weather] = ()

@@ -114,7 +114,7 @@ def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
 
 
 def of_search(
-    method: Method, objective: Objective, frames: int, controller: Controller, *, groups: int = 2
+    method: Method, objective: Objective, frames: int, controller: Controller, *, groups: int = 2, worlds: int = 1
 ) -> Workload:
     """Estimate a search for patterns.
 
@@ -124,6 +124,7 @@ def of_search(
         frames: number of frames in a group of drives.
         controller: controller that is timed.
         groups: number of groups searched.
+        worlds: number of recorded worlds, one a weather, each of which is driven in.
     """
     if isinstance(method, GradOpt):
         rungs = method.ladder(objective)
@@ -134,7 +135,7 @@ def of_search(
     # A start that is only valued takes a third of a step.
     count = sum(
         (rung.starts * rung.iterations + ((DRAWN if rung.screened else 0) + rung.offspring) / 3)
-        * _pictures(rung, objective, frames)
+        * _pictures(rung, objective, frames, worlds)
         for rung in rungs
     )
     timed = for_climbing(controller, _device_of(controller)) if isinstance(method, GradOpt) else controller
@@ -171,7 +172,7 @@ def of_cheapest(figures: int, objective: Objective, controller: Controller) -> W
         controller: controller that is timed.
     """
     frame_s = frame_seconds(for_climbing(controller, _device_of(controller)))
-    climbed = sum(rung.starts * rung.iterations * _pictures(rung, objective, STRETCH_STEPS) for rung in RUNGS)
+    climbed = sum(rung.starts * rung.iterations * _pictures(rung, objective, STRETCH_STEPS, 1) for rung in RUNGS)
     # Below each limit the pattern, and what it is without each of its figures, is only valued.
     valued = len(UNSURE) * STRETCH_STEPS * (1 + figures) / 3
     seconds = MOST_LEVELS * (climbed * _looks(objective) + valued) * frame_s
@@ -189,12 +190,12 @@ def _looks(objective: Objective) -> int:
     return 1 if variation is None else variation.draws
 
 
-def _pictures(rung: Rung, objective: Objective, frames: int) -> int:
+def _pictures(rung: Rung, objective: Objective, frames: int, worlds: int) -> int:
     """What one start of a rung takes at a step."""
     climbs_frames = rung.open_loop and not isinstance(objective, SpeedChange)
     if climbs_frames or not isinstance(objective, ClosedLoop):
         return math.ceil(frames / rung.every)
-    return math.ceil(STRETCH_STEPS / (rung.every if rung.every > 1 else objective.every))
+    return worlds * math.ceil(STRETCH_STEPS / (rung.every if rung.every > 1 else objective.every))
 
 
 def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Workload:
@@ -236,8 +237,7 @@ def of_recording(budget: Budget, *, processes: int = 1) -> Workload:
 
 def of_finding(budget: Budget, controller: Controller) -> Workload:
     """Estimate the search of a stress test, and the drives over what it finds."""
-    frames, worlds = budget.window.frames * (1 + budget.trajectories.count // 2), len(budget.recorded_in)
-    searched = of_search(budget.method, budget.objective, frames * worlds, controller).times(1 + budget.rounds)
-    # A recorded world has one light.
-    searched = searched.times(worlds) if budget.is_predicted else searched
-    return searched + of_drives(budget.select + budget.rounds * (1 + budget.select))
+    worlds = len(budget.recorded_in)
+    frames = budget.window.frames * (1 + budget.trajectories.count // 2) * worlds
+    searched = of_search(budget.method, budget.objective, frames, controller, worlds=worlds)
+    return searched.times(1 + budget.rounds) + of_drives(budget.select + budget.rounds * (1 + budget.select))
