@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--streets", nargs="+", help="names; by default all of the file, or harden.py's held-out ones")
     parser.add_argument("--weathers", nargs="+", type=Weather, default=(), help="others in which to drive over it")
     given = parser.parse_args()
+    given.weathers = list(dict.fromkeys(given.weathers))
     learnt = [*streets(TRAIN_ON), *load_scenarios(CROSSINGS)]
     own = load_scenarios(given.scenarios) if given.scenarios else None
     asked = [find_scenario(name, own) for name in given.streets] if given.streets else own or streets(JUDGE_ON)
@@ -80,7 +81,7 @@ def main() -> None:
         "seed": given.seed,
         "budget": given.budget,
         "judged": rows(judged),
-        "weathers": list(given.weathers),
+        "weathers": given.weathers,
         "judged_there": rows(elsewhere),
         "unjudged": unjudged,
     }

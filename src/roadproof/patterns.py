@@ -135,6 +135,16 @@ def visibilities(masks: Float[Tensor, "*b k p"]) -> Float[Tensor, "*b k p"]:
     return masks * bare_above
 
 
+def require_visible(paint: UInt8[np.ndarray, "s s 4"], name: str) -> None:
+    """See that a raster shows anything of its pattern.
+
+    Raises:
+        PatternError: it does not; the message says so by the pattern's name.
+    """
+    if not paint[..., 3].any():
+        raise PatternError(f"{name} paints nothing, so there is nothing to drive over; give another")
+
+
 def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray, "s s 4"]:
     """The pattern as an antialiased RGBA picture of the canvas (straight alpha).
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -11,8 +12,10 @@ from recorded_drives import drivable_set
 from roadproof.attacks import AttackResult
 from roadproof.cli.paint import OPTIONS, with_paint
 from roadproof.compositing import Variation
-from roadproof.paint import LaneMark
+from roadproof.paint import LaneMark, Site
+from roadproof.paint.limits import area_m2
 from roadproof.recordings import save_recordings
+from roadproof.search_space import SearchSpace
 
 CONTROLLER = textwrap.dedent(
     """
@@ -87,6 +90,15 @@ def test_limits_of_the_options_come_before_those_of_the_file(here, tmp_path, inv
     assert told.mark_distance_m >= 0.3
     names = {"#" + "".join(f"{round(255 * float(c)):02x}" for c in rgb) for rgb in result.pattern.colours}
     assert names <= {"#dededa", "#303030"}
+
+
+def test_the_file_that_the_documentation_shows_leaves_paint(tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "plausible-paint.md").read_text(encoding="utf-8")
+    (tmp_path / "paint.toml").write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
+    asked = with_paint(dict.fromkeys(OPTIONS) | {"paint": tmp_path / "paint.toml"})["paint"]
+    space = SearchSpace(figures=5, limits=asked.limits).on(Site(size_m=(6.8, 9.5)))
+    assert float(area_m2(space.drawn(8, 0), (6.8, 9.5)).max()) > 1.0
+    assert asked.variation == Variation(), "the page says that these are the defaults"
 
 
 def test_robust_comes_before_the_variation_of_the_file(here):

@@ -368,6 +368,25 @@ def test_a_reference_that_did_not_pass_is_refused(accepted, tmp_path):
         run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({}, "has measured nothing for test-road, clear-noon, magenta, expected deviation_m and left_lane from 0 on"),
+        ({"deviation_m": -5.0}, "has measured deviation_m -5, left_lane 1 for test-road, clear-noon, magenta"),
+    ],
+)
+def test_a_reference_with_which_nothing_could_be_compared_is_refused(accepted, tmp_path, changed, message):
+    stored = CHECK_FILE.content(accepted.reference)
+    case = next(each for each in stored["cases"] if each["name"] == "magenta")
+    measures = {name: case["measures"][name] | {"value": value} for name, value in changed.items()}
+    case["measures"] = case["measures"] | measures if measures else {}
+    path = tmp_path / "check.json"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(CheckError, match=message):
+        run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
+    assert not (tmp_path / "out" / "drives").exists()
+
+
 def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):
     with pytest.raises(CheckError, match="magenta, which the plan leaves out"):
         kept = {name: stored[:1] for name, stored in accepted.stored.items()}
@@ -483,6 +502,15 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         assert (team / "kept/smoke/check.json").exists()
     with pytest.raises(CheckError, match="is kept for a reference of the plan"):
         run_check(load_check("loose.toml", trust=True), magenta_shy(), "kept/smoke")
+
+
+def test_a_pattern_that_paints_nothing_is_refused_before_anything_is_driven(team, tmp_path):
+    plan = load_check(team / "check.toml", trust=True)
+    (name, stored), *_ = plan.stored.items()
+    thin = replace(stored[0].pattern, boxes=stored[0].pattern.boxes * torch.tensor([1, 1, 1e-6, 1, 1]))
+    with pytest.raises(PatternError, match=f"test-road, {stored[0].path.name} paints nothing"):
+        run_check(replace(plan, stored={name: (replace(stored[0], pattern=thin),)}), magenta_shy(), tmp_path / "out")
+    assert not (tmp_path / "out" / "drives").exists()
 
 
 def test_limits_that_leave_no_paint_are_refused_where_nothing_is_drawn_at_random_too(team, tmp_path):

@@ -376,7 +376,7 @@ def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
         ({"space": SearchSpace(figures=1, limits=PaintLimits(keep_out_m=9.0))}, "leaves no place for paint"),
         ({"training_step": lambda model, batch: batch.target.mean()}, "expected one number with a gradient"),
         ({"judge_on": [street(tmp_path, "next", 40.0)]}, "lie 25 m apart, on one street; expected at least 40 m"),
-        ({"rounds": 0}, "rounds is 0"),
+        ({"rounds": 0}, "rounds is 0, expected a whole number"),
         ({"seed": -1}, "seed is -1, expected a whole number from 0 to"),
         ({"processes": 2}, "2 processes; expected 1, or more with a factory"),
     ):

@@ -49,7 +49,8 @@ def test_the_strongest_attack_on_each_street_is_compared():
     assert (told.outcome, told.compared.over) == ("helped", "streets")
     assert (told.compared.left_lane_before, told.compared.left_lane_after) == (1.0, 0.0)
     assert told.sentence.startswith("It helped: over the strongest attack")
-    assert "0.30 m instead of 1.50 m" in told.sentence
+    assert "0.30 m instead of 1.50 m in the median" in told.sentence
+    assert "95 % over 3 streets)" in told.sentence
 
 
 def test_an_attack_that_leads_it_out_of_its_lane_by_fewer_metres_is_not_hidden():
@@ -60,6 +61,14 @@ def test_an_attack_that_leads_it_out_of_its_lane_by_fewer_metres_is_not_hidden()
     assert (told.compared.left_lane_before, told.compared.left_lane_after) == (1.0, 0.25)
     assert told.compared.after_m == pytest.approx(0.3)
     assert told.sentence.endswith("it leaves it in 25% of the drives instead of 100%.")
+
+
+def test_fewer_metres_are_no_help_where_more_drives_leave_their_lane():
+    rows = [each for name in "abc" for each in judged(name, "gradient", [1.0, 1.0], [0.3, 0.3])]
+    assert Judgement(tuple(rows), (BareDrives(4, 4, ()),) * 2).verdict().outcome == "helped"
+    rows[1] = replace(rows[1], left_lane=(True, False))
+    told = Judgement(tuple(rows), (BareDrives(4, 4, ()),) * 2).verdict()
+    assert (told.outcome, told.compared.better) == ("not shown", True)
 
 
 def test_hardening_that_spoils_clean_driving_did_not_help():
@@ -103,6 +112,7 @@ def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
 def test_one_street_has_an_interval_over_its_starts_and_one_start_has_none():
     told = verdict(("a", "k", [1.0, 1.2, 1.1], [0.1, 0.2, 0.2]))
     assert (told.outcome, told.compared.over, told.compared.change_m.count) == ("helped", "starts", 3)
+    assert "95 % over 3 starts on one street)" in told.sentence
     alone = verdict(("a", "k", [1.0], [0.1]))
     assert (alone.outcome, alone.compared.change_m.low) == ("not shown", None)
     assert "95 %" not in alone.sentence

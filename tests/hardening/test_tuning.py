@@ -183,6 +183,7 @@ def test_every_second_pass_over_the_streets_paints_what_attacks_do_not(street, m
         {"learning_rate": 0.0},
         {"repeats": 0},
         {"climb": -0.1},
+        {"learning_rate": float("inf")},
         {"bare": 1.5},
         {"found": -0.1},
     ],
@@ -190,6 +191,9 @@ def test_every_second_pass_over_the_streets_paints_what_attacks_do_not(street, m
 def test_tunings_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match="expected"):
         Tuning(**changes)
+    unchecked = Tuning.__init__.__wrapped__  # as it is without the tests' checks of types
+    with pytest.raises(TrainingError, match=r"steps is 2\.5, expected a whole number, 1 or more"):
+        unchecked(object.__new__(Tuning), steps=2.5)
 
 
 def test_steering_that_controls_cut_can_still_be_learnt_from():

@@ -201,7 +201,8 @@ def test_black_that_no_limit_leaves_is_refused():
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ({"max_area_m2": 0.0}, "max_area_m2 is 0.0"),
+        ({"max_area_m2": 0.001}, "max_area_m2 is 0.001, expected 0.01 to 10,000 m²"),
+        ({"marks": (LaneMark(points_m=tuple((float(k), 0.0) for k in range(2001))),)}, "marks have 2001 points"),
         ({"keep_out_m": 11.0}, "keep_out_m is 11.0"),
         ({"contrast": (0.5, 0.5)}, "contrast is"),
         ({"contrast": (0.5, 0.505)}, "at least 0.01 apart"),

@@ -38,7 +38,7 @@ from roadproof.io.known import known_by
 from roadproof.io.records import RecordFile
 from roadproof.io.text import read_json
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
-from roadproof.paint.limits import area_m2
+from roadproof.paint.limits import LEAST_M2, area_m2
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -203,8 +203,10 @@ def cheapest(
             run, level = fewer, fewer.level()
             levels.append(level)
         kept = folder and folder / _SEARCH / f"{number}.safetensors"
-        before = len(levels)
-        for lower in run.below(levels[-1].area_m2 * factor, kept):
+        before, most_m2 = len(levels), levels[-1].area_m2 * factor
+        if most_m2 < LEAST_M2:
+            break
+        for lower in run.below(most_m2, kept):
             level = lower.level()
             if level.predicted_m >= wanted_m:
                 run = lower

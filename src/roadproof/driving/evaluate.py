@@ -17,11 +17,11 @@ from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Epi
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange, require_on_road
 from roadproof.driving.trial import Trial
-from roadproof.errors import EpisodeError, PatternError
+from roadproof.errors import EpisodeError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import each_once
 from roadproof.limits import check_seed, is_whole
-from roadproof.patterns import Pattern, raster
+from roadproof.patterns import Pattern, raster, require_visible
 from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -154,8 +154,7 @@ def random_patterns(pattern: Pattern, count: int, *, seed: int = 0) -> tuple[Pat
 def _raster(pattern: Pattern | PatternImage) -> PatternImage:
     paint = raster(pattern) if isinstance(pattern, Pattern) else pattern
     check_image(paint)
-    if not paint[..., 3].any():
-        raise PatternError("the pattern paints nothing, so there is nothing to evaluate; give another")
+    require_visible(paint, "the pattern")
     return paint
 
 

@@ -36,7 +36,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
 from roadproof.io.known import known_by
 from roadproof.io.locks import working_in
-from roadproof.patterns import raster, read_paint, save_pattern
+from roadproof.patterns import raster, read_paint, require_visible, save_pattern
 from roadproof.pipeline.film import STRIP, STRIP_SIZE, Strip, film_drives, forget_film, pictures_at
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.processes import require_picklable
@@ -76,6 +76,7 @@ def run_check(
     Raises:
         CheckError: the reference is missing, damaged, or was made under other conditions, or the folder is its own
             or the stored patterns'.
+        PatternError: a pattern paints nothing, or the limits on paint leave none.
         ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator is not there or stopped answering.
         EpisodeError: the range of starts reaches off the road of a scenario.
@@ -228,6 +229,8 @@ class _Check:
 
     def _stretch(self, place: Place, world: Simulator, scenario: Scenario, paints: tuple[Paint, ...]) -> Stretch:
         images = {paint.name: raster(paint.pattern) for paint in paints}
+        for paint in paints:
+            require_visible(images[paint.name], f"{scenario.name}, {paint.path.name}")
         episodes = Episodes.of(world, self.controller, scenario, images, self.folder / DRIVES / scenario.name)
         return Stretch(plan=self.plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
 

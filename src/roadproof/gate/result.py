@@ -11,7 +11,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.intervals import Estimate
 from roadproof.driving.starts import StartOffset
 from roadproof.errors import CheckError
-from roadproof.gate.plan import BudgetName, CheckPlan, Key
+from roadproof.gate.plan import MEASURES, BudgetName, CheckPlan, Key
 from roadproof.gate.verdict import Kind, Status
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import RecordFile
@@ -162,6 +162,13 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     if not stored.cases or stored.not_passed:
         why = f"{stored.not_passed[0]}: {stored.not_passed[0].status}" if stored.cases else "it has no case"
         raise CheckError(f"the reference {path} did not pass ({why}), so nothing is measured by it; {AGAIN}")
+    for case in stored.cases:
+        if tuple(case.measures) != MEASURES[case.kind] or any(not each.value >= 0 for each in case.measures.values()):
+            told = ", ".join(f"{name} {each.value:g}" for name, each in case.measures.items()) or "nothing"
+            raise CheckError(
+                f"the reference {path} has measured {told} for {case}, expected {' and '.join(MEASURES[case.kind])} "
+                f"from 0 on; {AGAIN}"
+            )
     if left_out := [case for case in stored.cases if case.key not in plan.keys]:
         raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {AGAIN}")
     return {case.key: case for case in stored.cases}

@@ -150,7 +150,7 @@ def judge(
                 f"{_one(name, limit, digits)}, but its interval does; drive more starts or seeds"
             )
     for name, change in changes.items():
-        if before is None or name not in measures or name not in before:
+        if before is None or name not in measures:
             continue
         found, then = measures[name], before[name].value
         digits = digits_apart(name, found.value, then, then + change.absolute)

@@ -14,6 +14,7 @@ from roadproof.coverage import Shape
 from roadproof.datatypes import PAPER_WEATHERS, Weather
 from roadproof.errors import TrainingError
 from roadproof.hardening.tuning import Tuning
+from roadproof.limits import is_whole
 from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -54,10 +55,10 @@ class HardeningBudget:
     def __post_init__(self) -> None:
         if not (self.attack.is_predicted and self.judge.is_predicted):
             raise TrainingError("hardening searches in the recorded world; give attack and judge a path deviation")
-        if self.town_drives < 0 or not self.clean_weathers:
+        if not is_whole(self.town_drives) or self.town_drives < 0 or not self.clean_weathers:
             raise TrainingError(
-                f"{self.town_drives} drives through the town, {len(self.clean_weathers)} weathers of clean drives; "
-                "expected 0 or more, and at least one"
+                f"{self.town_drives!r:.40} drives through the town, {len(self.clean_weathers)} weathers of clean "
+                "drives; expected 0 or more, and at least one"
             )
 
     def varied(self, variation: Variation | None) -> HardeningBudget:

@@ -36,7 +36,7 @@ from roadproof.hardening.tuning import TrainingStep, require_loss
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
-from roadproof.limits import check_seed
+from roadproof.limits import check_seed, is_whole
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stages import OnProgress, check_street
 from roadproof.processes import require_opened
@@ -95,8 +95,8 @@ def harden(
     """
     folder = as_path(folder)
     check_streets(scenarios, judge_on)
-    if rounds < 1:
-        raise TrainingError(f"rounds is {rounds}, expected 1 or more")
+    if not is_whole(rounds) or rounds < 1:
+        raise TrainingError(f"rounds is {rounds!r:.40}, expected a whole number, 1 or more")
     if clean_on and not judge_on:
         raise TrainingError("clean_on is driven where the result is judged; give judge_on too, or leave it out")
     check_seed(seed, "seed", TrainingError)

@@ -119,14 +119,20 @@ class BeforeAfter:
         return self.change_m.low is not None and self.change_m.low > 0
 
     @property
+    def leaves_more(self) -> bool:
+        """Whether more drives than before leave the lane, by however few metres."""
+        return self.left_lane_after > self.left_lane_before
+
+    @property
     def sentence(self) -> str:
         """The comparison in words."""
         c = self.change_m
-        between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
+        counted = f"{c.count} {self.over}" if self.over == "streets" else f"{c.count} starts on one street"
+        between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {counted})" if c.low is not None else ""
         return (
             f"over the strongest attack on held-out streets it deviates by {self.after_m:.2f} m instead of "
-            f"{self.before_m:.2f} m, {c.value:+.2f} m on average{between}; over the one that leads it out of its lane "
-            f"most often it leaves it in {self.left_lane_after:.0%} of the drives instead of "
+            f"{self.before_m:.2f} m in the median, {c.value:+.2f} m on average{between}; over the one that leads it "
+            f"out of its lane most often it leaves it in {self.left_lane_after:.0%} of the drives instead of "
             f"{self.left_lane_before:.0%}"
         )
 
@@ -191,7 +197,8 @@ class Judgement:
         if worse or (compared is not None and compared.worse):
             outcome = "did not help"
         else:
-            shown = compared is not None and compared.better and lost <= 0 and not self.unjudged
+            shown = compared is not None and compared.better and not compared.leaves_more
+            shown = shown and lost <= 0 and not self.unjudged
             outcome = "helped" if shown else "not shown"
         return HardeningVerdict(
             outcome=outcome,

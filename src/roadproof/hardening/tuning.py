@@ -33,6 +33,7 @@ from roadproof.foreign import call
 from roadproof.hardening.batches import Pictures, TuningBatch, answers
 from roadproof.hardening.town import Town
 from roadproof.hardening.views import Street
+from roadproof.limits import is_whole
 from roadproof.search_space import SearchSpace
 
 PEDALS = 0.3
@@ -73,12 +74,12 @@ class Tuning:
     climb: float = 0.1
 
     def __post_init__(self) -> None:
-        least = min(self.steps, self.repeats)
-        if least < 1 or self.batch < 4 or not self.learning_rate > 0 or not self.climb >= 0:
+        for name, least in (("steps", 1), ("repeats", 1), ("batch", 4)):
+            if not is_whole(count := getattr(self, name)) or count < least:
+                raise TrainingError(f"{name} is {count!r:.40}, expected a whole number, {least} or more")
+        if not 0.0 < self.learning_rate < math.inf or not 0.0 <= self.climb < math.inf:
             raise TrainingError(
-                f"tuning of {self.steps} steps, {self.repeats} times each, of {self.batch} pictures at rate "
-                f"{self.learning_rate:g}, climbing {self.climb:g}; expected 1 or more, 1 or more, 4 or more, above 0, "
-                "and 0 or more"
+                f"learning_rate is {self.learning_rate}, climb {self.climb}; expected numbers above 0, and 0 or more"
             )
         for name in ("bare", "found"):
             if not 0.0 <= getattr(self, name) <= 1.0:

@@ -21,8 +21,14 @@ from roadproof.paint.keepout import KeepOut, keep_out
 from roadproof.paint.site import LaneMark, Site, rgb_of
 from roadproof.patterns import Pattern
 
+LEAST_M2, MOST_M2 = 0.01, 1e4
+"""The least and the largest limit of the area, m²: less than a square decimetre would not be seen."""
+
 MOST_M = 10.0
 """The largest keep-out, metres."""
+
+MOST_POINTS = 2000
+"""The most points of lane marks that are given; every figure is compared with each."""
 
 LIMITS = {
     "max_area_m2": "area",
@@ -41,13 +47,14 @@ class PaintLimits:
     """What paint may be; a field that is left out limits nothing.
 
     Args:
-        max_area_m2: largest sum of the figures' areas, m²; the widths of all figures shrink together to keep it.
+        max_area_m2: largest sum of the figures' areas, 0.01 to 10,000 m²; the widths of all figures shrink together to
+            keep it.
         colours: the only paints allowed, as "#d6a83d"; empty allows all.
         printable: whether offset print must be able to mix the paint (`colours.PRINT`).
         contrast: least and largest contrast of paint to the asphalt; 0 is none, 1 is black on white.
         keep_out_m: least distance of every figure's edge from the edge of every lane mark, metres.
         asphalt: colour of the bare road as paint, such as "#5a5a5b"; measured in the recordings by default.
-        marks: lane marks of the road; those that the recordings carry by default.
+        marks: lane marks of the road, of 2000 points at most; those that the recordings carry by default.
 
     Raises:
         PatternError: a value is out of its range, or a list where a tuple is expected.
@@ -68,8 +75,8 @@ class PaintLimits:
                 hash(value)
             except TypeError:
                 raise PatternError(f"{each.name} is {value!r:.80}, expected tuples in place of lists") from None
-        if self.max_area_m2 is not None and not 0.0 < self.max_area_m2 <= 1e4:
-            raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected square metres above 0, and 10,000 at most")
+        if self.max_area_m2 is not None and not LEAST_M2 <= self.max_area_m2 <= MOST_M2:
+            raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected {LEAST_M2} to {MOST_M2:,.0f} m²")
         if self.keep_out_m is not None and not 0.0 <= self.keep_out_m <= MOST_M:
             raise PatternError(f"keep_out_m is {self.keep_out_m}, expected 0 to {MOST_M:g} m")
         if self.contrast is not None:
@@ -78,6 +85,8 @@ class PaintLimits:
             least, most = self.contrast
             if not (0.0 <= least <= most - 0.01 + 1e-9 and most <= 1.0):
                 raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
+        if (points := sum(len(mark.points_m) for mark in self.marks or ())) > MOST_POINTS:
+            raise PatternError(f"marks have {points} points, expected {MOST_POINTS} at most; leave out those far away")
         for colour in (*self.colours, *([] if self.asphalt is None else [self.asphalt])):
             rgb_of(colour)
 
