@@ -95,6 +95,20 @@ def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_sma
     assert max(training_step(RampNet().eval(), batch).item() for batch in seen) > 0
 
 
+def test_a_tuning_that_comes_apart_is_told_and_not_gone_on_with(street, tmp_path):
+    def step(model, batch):
+        seen.append(batch)
+        return (model.bias - 3.0).square() * (100.0 if len(seen) > 40 else 1.0)
+
+    seen, kept = [], Checkpoint(tmp_path / "learning.safetensors", "this one")
+    tuning = Tuning(steps=40, repeats=2, batch=4, learning_rate=1e-9)
+    with pytest.raises(
+        TrainingError, match=r"came apart at step 30: its loss is [\d.e+]+, and was [\d.]+ at most before"
+    ):
+        tuned(street, tuning=tuning, step=step, checkpoint=kept)
+    assert int(kept.load("cpu")["steps"]) == 20
+
+
 def test_a_loss_that_is_a_root_is_none_that_cannot_be_learnt_from():
     def root(model, batch):
         answer = model.steer(batch.frames, batch.speed_mps, batch.command)

@@ -36,6 +36,13 @@ from roadproof.hardening.views import Street
 from roadproof.limits import is_whole
 from roadproof.search_space import SearchSpace
 
+_BETAS = (0.9, 0.99)
+"""AdamW's. With the usual 0.999 a weight that has hardly had a gradient for hundreds of batches, and then has one in
+every repeat of a batch, goes so far that networks have been lost to it."""
+
+_APART = 10.0
+"""A network is lost where its loss rises to so many times the highest before, each a mean of ten batches."""
+
 PEDALS = 0.3
 """What throttle and brake count in the loss, against 1 for steering."""
 
@@ -149,11 +156,12 @@ def tune(
     place = torch.device(device)
     lay_out(network.to(place).eval())
     parameters = [each for each in network.parameters() if each.requires_grad]
-    optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
+    optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, _BETAS, weight_decay=0.0)
     passes = _passes(teacher, spaces, found.to(device), tuning)
     besides = () if town is None else (town,)
     count = tuning.batch // (1 + len(besides))
-    total, begun = 0.0, 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
+    means, total = list[float](), 0.0
+    begun = 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
         pictures = passes[number // len(streets) % len(passes)]
@@ -170,9 +178,16 @@ def tune(
             optimiser.step()
             shown = [each.climbed(pictures.space, tuning.climb) for each in shown]
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
+            means.append(total / (number % 10 + 1) / tuning.repeats)
+            highest = max(means[:-1], default=0.0) or math.inf
+            if means[-1] > _APART * highest:
+                raise TrainingError(
+                    f"the tuning came apart at step {number + 1}: its loss is {means[-1]:.3g}, and was {highest:.3g} "
+                    "at most before; give another seed, or lower Tuning.learning_rate"
+                )
             if checkpoint is not None:
                 _keep(parameters, optimiser, checkpoint, number + 1)
-            on_step(number + 1, total / (number % 10 + 1) / tuning.repeats)
+            on_step(number + 1, means[-1])
             total = 0.0
 
 
