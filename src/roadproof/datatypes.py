@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum, StrEnum
 
 import numpy as np
@@ -187,3 +187,8 @@ class Observation:
     def shown(self) -> UInt8[np.ndarray, "hs ws 3"]:
         """The most detailed picture there is: the full camera picture, or the frame without one."""
         return self.frame if self.picture is None else self.picture
+
+    def copied(self) -> Observation:
+        """The same with pictures of its own: a driver may write into what it is given."""
+        picture = None if self.picture is None else self.picture.copy()
+        return replace(self, frame=self.frame.copy(), picture=picture)

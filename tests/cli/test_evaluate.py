@@ -66,6 +66,10 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
     assert Evaluation.load(run / "evaluation").trials == evaluation.trials
     assert (run / "evaluation" / "film.mp4").exists()
     (run / "evaluation" / "fidelity.npz").touch()
+    Image.new("RGBA", (400, 400)).save(workplace / "nothing.png")
+    refused = roadproof("evaluate", "nothing.png", *options, "--no-film", folder=workplace)
+    assert (refused.returncode, "paints nothing" in refused.stderr) == (2, True)
+    assert (run / "evaluation" / "film.mp4").exists()
     other = roadproof("evaluate", "magenta.png", *options, "--no-film", folder=workplace)
     assert (other.returncode, other.stderr) == (0, "")
     shown = {path.name for path in (run / "evaluation").iterdir()}

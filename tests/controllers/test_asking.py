@@ -84,6 +84,17 @@ def test_numbers_of_other_libraries_become_plain_ones():
     assert type(control.steer) is float
 
 
+def test_a_network_of_ours_whose_weights_are_broken_is_told_of_as_any_other():
+    network = pilotnet_controller()
+    with torch.no_grad():
+        for each in network.parameters():
+            each.mul_(1e30)
+    # With the tests' checks of types a line of theirs leads there too.
+    refused(r"^the controller's act .*: control \w+ is nan, expected a finite number", act_of, network, FRAME, 6.0, 2)
+    failed = [check.name for check in check_controller(network).failures]
+    assert {"finite answers", "drives"} <= {*failed}
+
+
 def test_wrong_pedals_are_named():
     refused(r"controls answered shape \(4, 1\), .* expected .* \(4, 3\), steer, throttle and brake", controls_of,
             bad_drivers.Pedals(), *batch())  # fmt: skip

@@ -77,7 +77,7 @@ def test_an_episode_holds_n_observations_and_the_controls_between_them(town):
     assert [seen.state.x_m for seen, _, _ in told] == episode.x_m.tolist() == [x for _, _, x in told]
     assert [speed for _, speed, _ in controller.seen] == episode.speed_mps[:-1].tolist()
     assert all(
-        one is two[0] for (one, _, _), two in zip(controller.seen, [(s.frame,) for s, _, _ in told], strict=False)
+        np.array_equal(one, seen.frame) for (one, _, _), (seen, _, _) in zip(controller.seen, told, strict=False)
     )
     assert [command for _, _, command in controller.seen] == episode.command[:-1].tolist()
 
@@ -141,6 +141,26 @@ def test_a_pattern_and_its_raster_are_the_same_paint(town):
         return frames[-1]
 
     np.testing.assert_array_equal(last_frame(PATTERN), last_frame(raster(PATTERN)))
+
+
+def test_a_driver_that_writes_into_its_pictures_changes_nobody_elses(town, episode):
+    class Masked(Straight):
+        def act(self, frame, speed_mps, command):
+            frame[:] = 0
+            return super().act(frame, speed_mps, command)
+
+    def masked(world):
+        def policy(seen):
+            seen.frame[:], seen.picture[:] = 0, 0
+            return Control(0.1, throttle=0.6)
+
+        return policy
+
+    shown = []
+    given = {"weather": Weather.CLOUDY_NOON, "seed": 7, "on_step": lambda seen, control: shown.append(seen.shown)}
+    assert same(rollout(town, Masked(0.1), SHORT, **given), episode)
+    rollout(town, masked, SHORT, full_pictures=True, **given)
+    assert all(each.any() for each in shown)
 
 
 def test_controls_are_kept_inside_their_range(town):

@@ -378,6 +378,12 @@ def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
     assert "driven by" in page.read_text()
     assert (tmp_path / "out" / "figures" / "transfer-deviation.png").exists()
     assert (tmp_path / "out" / "transfer-deviation.tex").exists()
+    # A controller that never came to a canvas has no drive there: the other tables are there all the same.
+    of_first = driven["scenario"] == driven["scenario"].iloc[0]
+    apart = concat([driven[of_first], driven[~of_first].assign(controller="pilotnet")])
+    text = write_tables(rows, tmp_path, tmp_path / "apart", apart).read_text()
+    assert "The transfer is left out: none of its patterns was driven over by every controller." in text
+    assert "driven by" not in text
 
 
 def test_a_transfer_of_another_state_of_the_study_is_left_out(finished, tmp_path):

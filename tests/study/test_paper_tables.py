@@ -201,6 +201,15 @@ def test_drives_that_were_left_out_are_not_promised_to_be_tried_again(records):
     assert table.note == "1 of 16 jobs."
 
 
+def test_a_note_says_how_few_scenarios_a_row_is_over(records):
+    told = [
+        each for each in records if (each["figures"], each["scenario"]) != ("5", "left-01") or each["method"] != "BO"
+    ]
+    note = tables_of(told)["overall-bo"].note
+    assert "Means over 3 to 4 scenarios × 1 seed" in note
+    assert "too narrow for as few as 3" in note
+
+
 def test_a_note_is_about_the_cases_that_are_compared(records):
     worse = [each | {"clean_points": 90.0} if each["scenario"] == "left-01" else each for each in records]
     told = [each for each in worse if (each["scenario"], each["method"]) != ("left-01", "BO")]
@@ -209,7 +218,7 @@ def test_a_note_is_about_the_cases_that_are_compared(records):
         assert "Means over 3 scenarios × 1 seed" in tables[name].note, name
         assert "as few as 3" in tables[name].note, name
         assert "bare road: 0.50 at clear noon" in tables[name].note, name
-    assert "Means over 4 scenarios × 1 seed" in tables["methods"].note
+    assert "Means over 3 to 4 scenarios × 1 seed" in tables["methods"].note
     assert "bare road: 13.29 at clear noon" in tables["methods"].note  # two of 14 cases
 
 

@@ -235,7 +235,7 @@ ASIDE = "[starts]\nturned_rad = 0.0\nfaster_mps = 0.0\nright_m = "
         ('name = "BO"', 'name = " "', "name of a method is ' ', expected letters that can be printed"),
         ('name = "BO"', 'name = "B\\nO"', "name of a method is 'B.nO', expected letters"),
         ("figures = [", "figures = [1000000000, ", "figures has 1000000000, expected 1 to 64"),
-        ("seeds = [0, 1]", "seeds = [100000000000000000000000]", "seeds is 1"),
+        ("seeds = [0, 1]", "seeds = [10000000000000000000]", "seeds is 1"),
         ("runs = 4", "cars = 1000000", "cars is 1000000, expected 0 to 500"),
         ("figures = [", "figures = [5, ", "figures has 5 twice"),
         ("seeds = [0, 1]", "seeds = [0, 0]", "seeds has 0 twice"),

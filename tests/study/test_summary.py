@@ -21,7 +21,7 @@ def test_methods_are_summed_up_as_they_were_searched():
         {**row("BO", None), "error": "no luck"},
     ]
     ours, theirs = summary(DataFrame(rows), "clear-noon")
-    assert "GradOpt: 1.50 m deviation, alone in clear-noon; found with 15 simulator calls in 30 s" in ours
+    assert "GradOpt: 1.50 m mean deviation, alone in clear-noon; found with 15 simulator calls in 30 s" in ours
     assert "BO: 0.50 m" in theirs
     assert failures(DataFrame(rows)) == ("left-01, K = 1, BO, seed 0: no luck",)
 
@@ -29,7 +29,7 @@ def test_methods_are_summed_up_as_they_were_searched():
 def test_a_job_of_which_drives_were_left_out_counts_as_much_as_others():
     rows = [row("GradOpt", 1.0), row("GradOpt", 2.0), row("GradOpt", 5.5, seed=1, search_calls=20)]
     (told,) = summary(DataFrame(rows), "clear-noon")
-    assert told.startswith("GradOpt: 3.50 m deviation, alone in clear-noon; found with 17 simulator calls")
+    assert told.startswith("GradOpt: 3.50 m mean deviation, alone in clear-noon; found with 17 simulator calls")
 
 
 def test_a_study_in_which_all_failed_has_failures_alone():
@@ -42,8 +42,8 @@ def test_a_transfer_is_a_mean_for_each_method_and_controller():
     found = {"found_on": "cil"}
     rows = [row("BO", 1.0, controller="cil", **found), row("BO", 2.0, controller="cil", **found)]
     assert transfer_summary(DataFrame([*rows, row("BO", 0.25, controller="own", **found)])) == (
-        "BO, found against cil: 1.50 m deviation of cil",
-        "BO, found against cil: 0.25 m deviation of own",
+        "BO, found against cil: 1.50 m mean deviation of cil",
+        "BO, found against cil: 0.25 m mean deviation of own",
     )
 
 
@@ -51,5 +51,5 @@ def test_a_pattern_of_which_drives_were_left_out_counts_as_much_as_others():
     told = {"found_on": "cil", "controller": "own"}
     five = [row("BO", 1.0, **told)] * 5
     assert transfer_summary(DataFrame([*five, row("BO", 4.0, seed=1, **told)])) == (
-        "BO, found against cil: 2.50 m deviation of own",
+        "BO, found against cil: 2.50 m mean deviation of own",
     )

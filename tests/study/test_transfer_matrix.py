@@ -48,6 +48,7 @@ def test_the_matrix_is_found_on_by_driven_by():
     assert [cell.best for cell in table.rows[0][1:]] == [True, False, True]
     assert "1 to 2 patterns a cell" in table.note
     assert "1 pairs were not driven" in table.note
+    assert "too narrow for as few as 1." in table.note
 
 
 def test_controllers_are_compared_over_the_patterns_that_all_of_them_drove():

@@ -96,6 +96,7 @@ STEERS_WRONG = {
     "number": (lambda steer: 0.1, "answered a float, expected"),
     "integers": (lambda steer: (10 * steer).long(), r"torch.int64, expected a floating-point tensor"),
     "None": (lambda steer: None, "answered None, expected"),
+    "sparse": (lambda steer: steer.detach().to_sparse(), r"torch.float32, torch.sparse_coo, expected"),
     "NaN": (lambda steer: steer * float("nan"), r"NaN or infinity for (\d+) of \1 frames"),
     "one_infinity": (lambda steer: steer / torch.arange(len(steer)).clamp(max=1), "NaN or infinity for 1 of"),
     "detached": (lambda steer: steer.detach(), "without a gradient to the frames; compute it in torch"),
@@ -155,6 +156,7 @@ SIZES = {
     "one": sized((88,)),
     "zero": sized((0, 200)),
     "fractions": sized((88.0, 200.0)),
+    "truths": sized((True, True)),
 }
 SIZE_RAISES = controller(input_size=property(raising(OSError("no camera"))))
 

@@ -111,11 +111,16 @@ def evaluate(
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     before = _shown_in(out)
-    if before[1:] != (paint.tobytes(),):
-        # Not after the drives: an interruption would leave them beside the results of this paint.
-        _forget_pictures(out)
     with where.open() as (world, driven):
         with stages() as show:
+
+            def tell(done: int, total: int) -> None:
+                if before[1:] != (paint.tobytes(),):
+                    # Not before anything is refused, and not after the drives: an interruption would leave them beside
+                    # the results of this paint.
+                    _forget_pictures(out)
+                show(f"Driving {driven.name}", done, total, "drives")
+
             evaluation = run(
                 partial(open_world, simulator, device) if processes > 1 else world,
                 who,
@@ -132,7 +137,7 @@ def evaluate(
                 seed=seed,
                 baseline=random_patterns(figures, random, seed=seed) if figures is not None and random else (),
                 processes=processes,
-                on_drive=lambda done, total: show(f"Driving {driven.name}", done, total, "drives"),
+                on_drive=tell,
             )
         if _shown_in(out) != before:
             _forget_pictures(out)

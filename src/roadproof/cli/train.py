@@ -15,7 +15,7 @@ from roadproof.limits import MANY
 def train(
     out: Out = Path("out/train"),
     network: Annotated[str, typer.Option(help="cil, pilotnet, waypoint or temporal.")] = "cil",
-    width: Annotated[float, number("CIL: factor on channels and units.", 0.01, 16.0)] = 1.0,
+    width: Annotated[float, number("CIL: factor on channels and units.", 1 / 32, 8.0)] = 1.0,
     start: Annotated[
         str | None, unset("Weights file or shipped controller to go on from.", default="fresh weights")
     ] = None,

@@ -17,9 +17,10 @@ from torch import Tensor
 from roadproof.controllers.frames import one_frame_batch
 from roadproof.controllers.protocol import Commands, Controller, Frames, PedalController, Speeds, TemporalController
 from roadproof.datatypes import Control
-from roadproof.errors import ControllerError
+from roadproof.errors import ControllerError, SimulatorError
 from roadproof.foreign import call
 from roadproof.io.pictures import MOST_PIXELS
+from roadproof.limits import is_whole
 
 NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
 
@@ -128,7 +129,11 @@ def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps:
     Raises:
         ControllerError: the controller raises, or answers with something that is no `Control` of numbers.
     """
-    control = call("the controller's act", controller.act, frame, speed_mps, command)
+    try:
+        control = call("the controller's act", controller.act, frame, speed_mps, command)
+    except SimulatorError as error:
+        # Of a network that is not the user's own code no line says what was wrong.
+        raise ControllerError(f"the controller's act gives no control: {error}; check its weights") from error
     if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # controllers are the user's
         raise ControllerError(f"the controller's act answered {_in_words(control)}, expected a roadproof.Control")
     values = cast("tuple[object, ...]", (control.steer, control.throttle, control.brake))
@@ -153,7 +158,7 @@ def frame_size_of(controller: Controller) -> tuple[int, int] | None:
     if size is None:
         return None
     pair = cast("tuple[object, ...]", size) if isinstance(size, tuple) else ()
-    if len(pair) != 2 or not all(isinstance(side, int) and side > 0 for side in pair):
+    if len(pair) != 2 or not all(is_whole(side) and side > 0 for side in pair):
         raise ControllerError(
             f"the controller's input_size is {size!r:.100}, expected a tuple (height, width) of whole numbers above 0, "
             "or None for any size"
@@ -201,8 +206,9 @@ def _checked(answer: object, member: str, frames: Frames) -> Float[Tensor, "b ..
     expected = f"expected a floating-point tensor of shape {shape}, {meant}"
     if not isinstance(answer, Tensor):
         raise ControllerError(f"{what} answered {_in_words(answer)}, {expected}")
-    if answer.shape != shape or not answer.is_floating_point():
-        raise ControllerError(f"{what} answered shape {tuple(answer.shape)}, {answer.dtype}, {expected}")
+    if answer.shape != shape or not answer.is_floating_point() or answer.layout is not torch.strided:
+        sparse = "" if answer.layout is torch.strided else f", {answer.layout}"
+        raise ControllerError(f"{what} answered shape {tuple(answer.shape)}, {answer.dtype}{sparse}, {expected}")
     if answer.device != frames.device:
         raise ControllerError(f"{what} answered on {answer.device}, expected {frames.device}, where the frames are")
     return answer

@@ -105,7 +105,7 @@ def rollout(
     with threads(1):
         policy = policy_of(driver, simulator)
         while not (stopped := until is not None and until(seen)) and not seen.done:
-            control = policy(seen)
+            control = policy(seen.copied())
             if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # drivers are the user's
                 raise ControllerError(f"the driver answered {control!r}, expected a roadproof.datatypes.Control")
             controls.append(control.clipped())

@@ -7,13 +7,15 @@ import math
 import tomllib
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from roadproof.errors import RoadproofError
 from roadproof.io.files import one_line, open_file
 
 MOST_TEXT_BYTES = 32 * 2**20
 """A longer JSON or TOML file is not read."""
+
+Leaf = TypeVar("Leaf", str, int)
 
 _LONGEST_TEXT = 1000
 _MOST_DIGITS = 20
@@ -94,12 +96,16 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
         error: the type of error to raise.
 
     Raises:
-        error: the file cannot be read, is not valid TOML, or has a text that can name nothing: of more than 1,000
-            characters, or with a NUL; the message names it.
+        error: the file cannot be read, is not valid TOML, or has a text that can name nothing, of more than 1,000
+            characters or with a NUL; the message names it.
     """
     try:
         content = tomllib.loads(text_of(path, MOST_TEXT_BYTES))
-        odd = next((text for text in _texts(content) if len(text) > _LONGEST_TEXT or "\0" in text), None)
+        for number in _leaves(content, int):
+            # A hexadecimal one may be of any length, and could not even be shown.
+            if abs(number) >= 10**_MOST_DIGITS:
+                raise ValueError(f"an integer has more than {_MOST_DIGITS} digits")
+        odd = next((text for text in _leaves(content, str) if len(text) > _LONGEST_TEXT or "\0" in text), None)
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
     except (MemoryError, ValueError, RecursionError) as reason:
@@ -110,16 +116,17 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
     return content
 
 
-def _texts(value: object) -> Generator[str]:
-    if isinstance(value, str):
+def _leaves(value: object, kind: type[Leaf]) -> Generator[Leaf]:
+    """All keys and values of a kind, however deep."""
+    if isinstance(value, kind):
         yield value
     elif isinstance(value, dict):
         for key, each in cast("dict[str, object]", value).items():
-            yield key
-            yield from _texts(each)
+            yield from _leaves(key, kind)
+            yield from _leaves(each, kind)
     elif isinstance(value, list):
         for each in cast("list[object]", value):
-            yield from _texts(each)
+            yield from _leaves(each, kind)
 
 
 def read_json(

@@ -20,6 +20,7 @@ from roadproof.study.history import Progress
 from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import DEVIATION, Block, Results
 from roadproof.study.statistics import mean_over_scenarios
+from roadproof.study.table_notes import intervals_over
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000", "#882255", "#7a7f85")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
@@ -57,6 +58,12 @@ def style(results: Results, method: str) -> dict[str, Any]:
 def by_figures(results: Results) -> Picture:
     """Deviation and penalty of every method for each K, with their intervals."""
     figure = Figure(figsize=(10.0, 3.9), layout="constrained")
+    fewest = min(
+        results.drives_of(block, [method.name], figures)["scenario"].nunique()
+        for block in results.overall
+        for method in results.methods
+        for figures in results.figures
+    )
     for column, block in enumerate(results.overall):
         axes = figure.add_subplot(1, 2, column + 1)
         for number, method in enumerate(results.methods):
@@ -70,8 +77,8 @@ def by_figures(results: Results) -> Picture:
     how = f"penalty {'in traffic' if results.overall[1].traffic else 'alone on the road'}"
     return Picture(
         "by-figures",
-        f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}: means over scenarios "
-        "with 95 % bootstrap intervals.",
+        f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}: means over the "
+        f"scenarios that each has{intervals_over(fewest)}.",
         figure,
     )
 
@@ -137,8 +144,9 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
         "progress",
         "What the best pattern so far does when driven, against simulator calls and seconds: median over scenarios and "
         "seeds, and their range, from where all of a method's searches have begun. Black-box searches choose the best "
-        "by their own measure, so a line may fall; a search on recordings is a point, where its answer was driven; a "
-        "hollow point, where no drive chose the pattern, is the mean of those that judge it.",
+        "by their own measure, so a line may fall; a search on recordings is a point, at the drive that chose its "
+        "answer, which flatters it as the lines are flattered; a hollow point, where no drive chose the pattern, is "
+        "the mean of those that judge it.",
         figure,
     )
 

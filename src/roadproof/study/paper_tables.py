@@ -122,7 +122,8 @@ def _paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Blo
             rows.append((*where, Number(found.difference), share, str(found.ties), told, *counts))
     said = (
         f"Difference: {ours} less {theirs}, above 0 where {ours} is stronger. p: two-sided Wilcoxon signed-rank "
-        "test of the scenarios’ mean differences, not corrected for the number of rows."
+        "test of the scenarios’ mean differences, not corrected for the number of rows. An interval without a width "
+        "says that no scenario differed, not that none would."
     )
     return Table(
         name=name,

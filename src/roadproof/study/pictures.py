@@ -118,8 +118,8 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
     figure = _grid(scenarios, titles, rows, (1.25 * len(columns) + 0.9, 1.95 * len(rows) + 0.6))
     return figure and Picture(
         "patterns",
-        f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the deviation it "
-        "caused, driven alone in the first weather.",
+        f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the mean "
+        "deviation it caused, driven alone in the first weather.",
         figure,
     )
 

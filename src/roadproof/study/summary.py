@@ -22,7 +22,7 @@ def summary(rows: Frame, home: str) -> tuple[str, ...]:
     of_jobs = alone.astype(dict.fromkeys(numbers, float)).groupby(["method", *_OTHERS], sort=False)[numbers].mean()
     means = of_jobs.groupby(level="method", sort=False).mean()
     return tuple(
-        f"{method}: {deviation_m:.2f} m deviation, alone in {home}; found with {calls:.0f} simulator calls in "
+        f"{method}: {deviation_m:.2f} m mean deviation, alone in {home}; found with {calls:.0f} simulator calls in "
         f"{seconds:.0f} s"
         for method, deviation_m, calls, seconds in means.itertuples()
     )
@@ -40,6 +40,6 @@ def transfer_summary(rows: Frame) -> tuple[str, ...]:
     patterns = made_by_all(rows).groupby([*_OTHERS, *whose], sort=False)["deviation_m"].mean()
     means = patterns.groupby(level=whose, sort=False).mean()
     return tuple(
-        f"{method}, found against {found_on}: {deviation_m:.2f} m deviation of {controller}"
+        f"{method}, found against {found_on}: {deviation_m:.2f} m mean deviation of {controller}"
         for (method, found_on, controller), deviation_m in means.items()
     )

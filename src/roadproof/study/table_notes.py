@@ -33,7 +33,7 @@ def table_note(
         for block in blocks
     )
     cases = [_cases(results, block, methods, compared=compared) for block in blocks]
-    told = [_averaged(cases), said, *_bare_road(blocks, cases), *missing(results, blocks, methods)]
+    told = [_averaged(cases, compared=compared), said, *_bare_road(blocks, cases), *missing(results, blocks, methods)]
     return " ".join([f"{'; '.join(measured)}; all of it driven.", *told])
 
 
@@ -44,18 +44,26 @@ def _cases(results: Results, block: Block, methods: Sequence[str], *, compared: 
     return cases.dropna() if compared else cases
 
 
-def _averaged(cases: Sequence[Frame]) -> str:
-    scenarios: list[set[str]] = [set(each.index.get_level_values("scenario")) for each in cases]
-    seeds: set[int] = {seed for each in cases for seed in each.index.get_level_values("seed")}
-    count = len(set[str]().union(*scenarios))
-    if not count:
+def _averaged(cases: Sequence[Frame], *, compared: bool) -> str:
+    # A number is of one K, and where methods are not compared of one method.
+    columns = [[each] if compared else [each[method].dropna() for method in each] for each in cases]
+    held = [one.reset_index() for each in columns for one in each if len(one)]
+    if not held:
         return "There is no case that all of them have."
-    over = f"{count_of(count, 'scenario')} × {count_of(len(seeds), 'seed')}"
-    if count < 2:
+    counts: set[int] = {count for each in held for count in each.groupby("figures")["scenario"].nunique()}
+    seeds: set[int] = {seed for each in held for seed in each["seed"]}
+    fewest, most = min(counts), max(counts)
+    scenarios = count_of(most, "scenario") if fewest == most else f"{fewest} to {most} scenarios"
+    over = f"{scenarios} × {count_of(len(seeds), 'seed')}"
+    if most < 2:
         return f"Means over {over}; one scenario has no interval."
-    fewest = min(map(len, scenarios))
-    narrow = f", which are too narrow for as few as {fewest}" if fewest < ENOUGH else ""
-    return f"Means over {over} with 95 % bootstrap intervals over scenarios{narrow}."
+    return f"Means over {over}{intervals_over(fewest)}."
+
+
+def intervals_over(scenarios: int) -> str:
+    """How means have their intervals, and that these are too narrow where the means are over so few scenarios."""
+    narrow = f", which are too narrow for as few as {scenarios}" if scenarios < ENOUGH else ""
+    return f" with 95 % bootstrap intervals over scenarios{narrow}"
 
 
 def _bare_road(blocks: Sequence[Block], cases: Sequence[Frame]) -> list[str]:

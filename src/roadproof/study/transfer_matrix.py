@@ -13,6 +13,9 @@ from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_
 from roadproof.study.rows import Frame, made_by_all
 from roadproof.study.statistics import mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
+from roadproof.study.table_notes import intervals_over
+
+_PAIRS = ["found_on", "controller"]
 
 
 def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
@@ -34,12 +37,13 @@ def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
         return MISSING if mean is None else Number(mean, best=several and bool(mean.value == worst[driver]))
 
     counts, missing = sorted({mean.count for mean in means}), matrix.size - len(means)
+    fewest = int(shared_drives(rows).groupby("found_on")["scenario"].nunique().min())
     return Table(
         name=f"transfer-{slug(metric.title)}",
         title=f"Transfer: {metric.title.lower()} of patterns found against one controller, driven by another",
         note=f"{metric.title} in {metric.unit}, driven; means over "
         f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} patterns a cell, over the drives that "
-        "all controllers of its row made, with 95 % bootstrap intervals over scenarios."
+        f"all controllers of its row made,{intervals_over(fewest)}."
         + (" The highest of each driver in bold." if several else "")
         + (f" {missing} pairs were not driven." if missing else ""),
         header=((Heading(""), Heading("driven by", len(driven_by))), headings("found on", *driven_by)),
@@ -76,24 +80,34 @@ def transfer_map(rows: Frame, metric: Metric = DEVIATION) -> Picture:
     )
 
 
+def shared_drives(rows: Frame) -> Frame:
+    """The rows of a transfer that every controller made, which alone are compared.
+
+    Raises:
+        StudyError: there is no row, or a column is missing.
+    """
+    if rows.empty:
+        raise StudyError("the transfer has no rows; drive some patterns first")
+    for column in (*_PAIRS, *JOB):
+        if column not in rows:
+            raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
+    check_names(rows, _PAIRS)
+    return made_by_all(rows)
+
+
 def _matrix(rows: Frame, metric: Metric) -> Frame:
     """Means over patterns: a row for whom they were found against, a column for who drove; None where nobody.
 
     All cells of a row are over the same drives, those that every controller in it made.
     """
-    if rows.empty:
-        raise StudyError("the transfer has no rows; drive some patterns first")
-    pairs = ["found_on", "controller"]
-    for column in (*pairs, *JOB, metric.column):
-        if column not in rows:
-            raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
-    check_names(rows, pairs)
-    check_finite(rows, metric.column)
-    shared = made_by_all(rows)
+    shared = shared_drives(rows)
     if shared.empty:
-        raise StudyError("no pattern of the transfer was driven over by every controller; run the transfer again")
-    patterns = shared.groupby([*JOB, *pairs], sort=False)[metric.column].mean()
-    means = patterns.groupby(level=pairs, sort=False).apply(mean_over_scenarios)
+        raise StudyError("no pattern of the transfer was driven over by every controller; leave the transfer out")
+    if metric.column not in shared:
+        raise StudyError(f"the transfer's rows have no column {metric.column!r}; run the transfer again")
+    check_finite(rows, metric.column)
+    patterns = shared.groupby([*JOB, *_PAIRS], sort=False)[metric.column].mean()
+    means = patterns.groupby(level=_PAIRS, sort=False).apply(mean_over_scenarios)
     # Controllers that stand on both sides first and in one order, so that the diagonal is their own patterns.
     found, drivers = list(rows["found_on"].unique()), list(rows["controller"].unique())
     driven = [*(name for name in found if name in drivers), *(name for name in drivers if name not in found)]
