@@ -75,6 +75,8 @@ def test_a_run_that_is_refused_leaves_a_study_as_it_was(two_jobs, tmp_path):
     other = dataclasses.replace(two_jobs, figures=(3,))
     with pytest.raises(StudyError, match="no Ray cluster answers"):
         run_study(other, tmp_path, counts, cluster="nowhere")
+    with pytest.raises(StudyError, match=r"no Ray cluster answers at 127\.0\.0\.1:1: .*refused"):
+        run_study(other, tmp_path, counts, cluster="127.0.0.1:1")
     with pytest.raises(StudyError, match="workers is 2, but a cluster has as many"):
         run_study(other, tmp_path, counts, cluster="local", workers=2)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == kept

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import tempfile
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -11,6 +12,7 @@ from contextlib import closing, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import urlsplit
 
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.locks import own_folder, working_in
@@ -26,6 +28,9 @@ Work: TypeAlias = Callable[[Job, Path], JobResult]
 
 OnJob: TypeAlias = Callable[[int, Job, JobResult], object]
 """Called with how many jobs are done, the last one, and its result."""
+
+_ANSWERS_S = 10.0
+"""So long an address of a cluster has to answer."""
 
 
 def run_study(
@@ -109,6 +114,7 @@ def _ray_at(cluster: str | None) -> Generator[Any]:
     if ray.is_initialized():
         yield ray
         return
+    _require_listening(cluster)
     try:
         ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -117,6 +123,16 @@ def _ray_at(cluster: str | None) -> Generator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _require_listening(cluster: str) -> None:
+    """See that somebody listens at an address with a port; Ray itself would ask there for minutes."""
+    try:
+        address = urlsplit(cluster if "//" in cluster else f"//{cluster}")
+        if address.hostname is not None and address.port is not None:
+            socket.create_connection((address.hostname, address.port), timeout=_ANSWERS_S).close()
+    except (OSError, ValueError) as error:
+        raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
