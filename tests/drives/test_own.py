@@ -363,6 +363,10 @@ def test_columns_are_known_or_named(tmp_path):
     table.unlink()
     with pytest.raises(RecordingError, match="cannot read"):
         import_drives(folder)
+    (folder / "drives.toml").rename(tmp_path / "drives.toml")
+    (folder / "drives.toml").symlink_to(tmp_path / "drives.toml")
+    with pytest.raises(RecordingError, match=r"drives\.toml is a link that leads out of"):
+        import_drives(folder)
 
 
 def test_a_table_needs_a_picture_and_corners_that_are_the_canvas(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
+from roadproof.io.files import inside
 from roadproof.io.tables import build
 from roadproof.io.text import read_toml
 from roadproof.lens import LensModel
@@ -158,7 +159,7 @@ def read_plan(folder: Path) -> OwnDrives:
     """Read drives.toml of a folder.
 
     Raises:
-        RecordingError: the file is missing or damaged, or has an unknown key.
+        RecordingError: the file is missing or damaged, has an unknown key, or is a link that leads out of the folder.
     """
-    path = folder / PLAN
+    path = inside(folder, PLAN, "plan", RecordingError)
     return build(OwnDrives, read_toml(path, RecordingError), str(path), RecordingError)
