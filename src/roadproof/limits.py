@@ -12,6 +12,10 @@ MAX_FIGURES = 64
 MAX_CROWD = 500
 MAX_PROCESSES = 256
 MANY = 1_000_000
+LEAST_PAINT_M2, MOST_PAINT_M2 = 0.01, 10_000.0
+"""Of the limit on painted area: less than a square decimetre would not be seen."""
+LEAST_WIDTH, MOST_WIDTH = 1 / 32, 8.0
+"""Of the factor on CIL's channels and units."""
 
 
 def is_whole(number: object) -> TypeGuard[int]:

@@ -105,6 +105,8 @@ def test_a_tuning_that_comes_apart_is_told_and_not_gone_on_with(street, tmp_path
     with pytest.raises(TrainingError, match=r"came apart at step 30: its loss is \S+, and was [\d.]+ at most before"):
         tuned(street, tuning=tuning, step=step, checkpoint=kept)
     assert int(kept.load(torch.device("cpu"))["steps"]) == 20
+    with pytest.raises(TrainingError, match="came apart at step 30: "):
+        tuned(street, tuning=tuning, step=step, checkpoint=kept)
 
 
 def test_a_loss_that_is_a_root_is_none_that_cannot_be_learnt_from():

@@ -37,8 +37,9 @@ from roadproof.io.identity import digest, require_same, stated
 from roadproof.io.known import known_by
 from roadproof.io.records import RecordFile
 from roadproof.io.text import read_json
+from roadproof.limits import LEAST_PAINT_M2
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
-from roadproof.paint.limits import LEAST_M2, area_m2
+from roadproof.paint.limits import area_m2
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -204,7 +205,7 @@ def cheapest(
             levels.append(level)
         kept = folder and folder / _SEARCH / f"{number}.safetensors"
         before, most_m2 = len(levels), levels[-1].area_m2 * factor
-        if most_m2 < LEAST_M2:
+        if most_m2 < LEAST_PAINT_M2:
             break
         for lower in run.below(most_m2, kept):
             level = lower.level()

@@ -111,11 +111,12 @@ def evaluate(
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     before = _shown_in(out)
+    of_other_paint = before[1:] != (paint.tobytes(),)
     with where.open() as (world, driven):
         with stages() as show:
 
             def tell(done: int, total: int) -> None:
-                if before[1:] != (paint.tobytes(),):
+                if of_other_paint:
                     # Not before anything is refused, and not after the drives: an interruption would leave them beside
                     # the results of this paint.
                     _forget_pictures(out)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from roadproof.cli.options import number, unset
+from roadproof.limits import LEAST_PAINT_M2, MOST_PAINT_M2
 
 if TYPE_CHECKING:
     from roadproof.compositing import Variation
@@ -37,7 +38,9 @@ def _grouped(option: Any) -> Any:  # noqa: ANN401
 
 
 OPTIONS: dict[str, Any] = {
-    "max_area": Annotated[float | None, _grouped(number("Largest area of paint, m².", 0.01, 10_000.0, default=False))],
+    "max_area": Annotated[
+        float | None, _grouped(number("Largest area of paint, m².", LEAST_PAINT_M2, MOST_PAINT_M2, default=False))
+    ],
     "colours": Annotated[str | None, _grouped(unset("The only paints there are, as #dededa, with commas between."))],
     "printable": Annotated[bool, _grouped(typer.Option("--printable", help="Only colours that offset print can mix."))],
     "contrast": Annotated[

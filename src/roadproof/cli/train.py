@@ -9,13 +9,13 @@ import typer
 
 from roadproof.cli.options import Device, Out, Processes, Seed, number, unset
 from roadproof.cli.output import say
-from roadproof.limits import MANY
+from roadproof.limits import LEAST_WIDTH, MANY, MOST_WIDTH
 
 
 def train(
     out: Out = Path("out/train"),
     network: Annotated[str, typer.Option(help="cil, pilotnet, waypoint or temporal.")] = "cil",
-    width: Annotated[float, number("CIL: factor on channels and units.", 1 / 32, 8.0)] = 1.0,
+    width: Annotated[float, number("CIL: factor on channels and units.", LEAST_WIDTH, MOST_WIDTH)] = 1.0,
     start: Annotated[
         str | None, unset("Weights file or shipped controller to go on from.", default="fresh weights")
     ] = None,

@@ -29,6 +29,7 @@ from roadproof.controllers.conditional import BRANCHES, ConditionalNetwork
 from roadproof.controllers.frames import require_frame_size
 from roadproof.controllers.weights import initialise_xavier, seeded
 from roadproof.errors import ControllerError
+from roadproof.limits import LEAST_WIDTH, MOST_WIDTH
 
 _KERNEL_STRIDE_CHANNELS = (
     (5, 2, 32), (3, 1, 32), (3, 2, 64), (3, 1, 64), (3, 2, 128), (3, 1, 128), (3, 1, 256), (3, 1, 256),
@@ -76,7 +77,7 @@ class CIL(ConditionalNetwork):
     input_size = (88, 200)
 
     def __init__(self, *, width: float = 1.0, seed: int = 0) -> None:
-        if not 1 / 32 <= width <= 8:
+        if not LEAST_WIDTH <= width <= MOST_WIDTH:
             raise ControllerError(f"CIL width is {width}, expected a factor between 1/32 and 8")
         super().__init__()
         self.width = width

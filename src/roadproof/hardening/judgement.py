@@ -197,8 +197,8 @@ class Judgement:
         if worse or (compared is not None and compared.worse):
             outcome = "did not help"
         else:
-            shown = compared is not None and compared.better and not compared.leaves_more
-            shown = shown and lost <= 0 and not self.unjudged
+            better = compared is not None and compared.better and not compared.leaves_more
+            shown = better and lost <= 0 and not self.unjudged
             outcome = "helped" if shown else "not shown"
         return HardeningVerdict(
             outcome=outcome,

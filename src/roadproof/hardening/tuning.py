@@ -160,8 +160,8 @@ def tune(
     passes = _passes(teacher, spaces, found.to(device), tuning)
     besides = () if town is None else (town,)
     count = tuning.batch // (1 + len(besides))
-    means, total = list[float](), 0.0
-    begun = 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
+    total = 0.0
+    begun, highest = (0, 0.0) if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
         pictures = passes[number // len(streets) % len(passes)]
@@ -178,16 +178,16 @@ def tune(
             optimiser.step()
             shown = [each.climbed(pictures.space, tuning.climb) for each in shown]
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
-            means.append(total / (number % 10 + 1) / tuning.repeats)
-            highest = max(means[:-1], default=0.0) or math.inf
-            if means[-1] > _APART * highest:
+            mean = total / (number % 10 + 1) / tuning.repeats
+            if highest and mean > _APART * highest:
                 raise TrainingError(
-                    f"the tuning came apart at step {number + 1}: its loss is {means[-1]:.3g}, and was {highest:.3g} "
-                    "at most before; give another seed, or lower Tuning.learning_rate"
+                    f"the tuning came apart at step {number + 1}: its loss is {mean:.3g}, and was {highest:.3g} at "
+                    "most before; give another seed, or lower Tuning.learning_rate"
                 )
+            highest = max(highest, mean)
             if checkpoint is not None:
-                _keep(parameters, optimiser, checkpoint, number + 1)
-            on_step(number + 1, means[-1])
+                _keep(parameters, optimiser, checkpoint, number + 1, highest)
+            on_step(number + 1, mean)
             total = 0.0
 
 
@@ -201,26 +201,39 @@ def _passes(
     return [each for other in others for each in (own, other)] or [own]
 
 
-def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint, steps: int) -> None:
-    """Keep the parameters and AdamW's moments after so many steps."""
-    kept = {"steps": torch.tensor(steps)}
+def _keep(
+    parameters: Sequence[nn.Parameter],
+    optimiser: torch.optim.AdamW,
+    checkpoint: Checkpoint,
+    steps: int,
+    highest: float,
+) -> None:
+    """Keep the parameters and AdamW's moments after so many steps, and the highest loss so far."""
+    kept = {"steps": torch.tensor(steps), "highest": torch.tensor(highest, dtype=torch.float64)}
     for k, each in enumerate(parameters):
         kept |= {f"{k}.value": each} | {f"{k}.{name}": moment for name, moment in optimiser.state[each].items()}
     checkpoint.save(kept)
 
 
-def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint) -> int:
-    """Put back what a file keeps, where there is one that is whole and of this tuning; the number of steps done."""
+def _resume(
+    parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint
+) -> tuple[int, float]:
+    """Put back what a file keeps, where there is one that is whole and of this tuning.
+
+    Returns:
+        The number of steps done, and the highest loss so far; 0 for both where nothing is kept.
+    """
     kept = checkpoint.load(parameters[0].device)
     if kept is None:
-        return 0
+        return 0, 0.0
     for k, each in enumerate(parameters):
         own = {name.partition(".")[2]: value for name, value in kept.items() if name.startswith(f"{k}.")}
         each.data.copy_(own.pop("value"))
         # A parameter that had no gradient has no moments.
         if own:
             optimiser.state[each] = own
-    return int(kept["steps"])
+    # A file of an older roadproof does not say how high the loss was.
+    return int(kept["steps"]), float(kept.get("highest", 0.0))
 
 
 def require_loss(

@@ -16,13 +16,11 @@ from torch import Tensor
 
 from roadproof.constants import placed
 from roadproof.errors import PatternError
+from roadproof.limits import LEAST_PAINT_M2, MOST_PAINT_M2
 from roadproof.paint.colours import AllowedColours, allowed_colours
 from roadproof.paint.keepout import KeepOut, keep_out
 from roadproof.paint.site import LaneMark, Site, rgb_of
 from roadproof.patterns import Pattern
-
-LEAST_M2, MOST_M2 = 0.01, 1e4
-"""The least and the largest limit of the area, m²: less than a square decimetre would not be seen."""
 
 MOST_M = 10.0
 """The largest keep-out, metres."""
@@ -75,8 +73,10 @@ class PaintLimits:
                 hash(value)
             except TypeError:
                 raise PatternError(f"{each.name} is {value!r:.80}, expected tuples in place of lists") from None
-        if self.max_area_m2 is not None and not LEAST_M2 <= self.max_area_m2 <= MOST_M2:
-            raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected {LEAST_M2} to {MOST_M2:,.0f} m²")
+        if self.max_area_m2 is not None and not LEAST_PAINT_M2 <= self.max_area_m2 <= MOST_PAINT_M2:
+            raise PatternError(
+                f"max_area_m2 is {self.max_area_m2}, expected {LEAST_PAINT_M2} to {MOST_PAINT_M2:,.0f} m²"
+            )
         if self.keep_out_m is not None and not 0.0 <= self.keep_out_m <= MOST_M:
             raise PatternError(f"keep_out_m is {self.keep_out_m}, expected 0 to {MOST_M:g} m")
         if self.contrast is not None:

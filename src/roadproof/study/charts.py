@@ -20,7 +20,7 @@ from roadproof.study.history import Progress
 from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import DEVIATION, Block, Results
 from roadproof.study.statistics import mean_over_scenarios
-from roadproof.study.table_notes import intervals_over
+from roadproof.study.table_notes import averaged, cases_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000", "#882255", "#7a7f85")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
@@ -58,12 +58,6 @@ def style(results: Results, method: str) -> dict[str, Any]:
 def by_figures(results: Results) -> Picture:
     """Deviation and penalty of every method for each K, with their intervals."""
     figure = Figure(figsize=(10.0, 3.9), layout="constrained")
-    fewest = min(
-        results.drives_of(block, [method.name], figures)["scenario"].nunique()
-        for block in results.overall
-        for method in results.methods
-        for figures in results.figures
-    )
     for column, block in enumerate(results.overall):
         axes = figure.add_subplot(1, 2, column + 1)
         for number, method in enumerate(results.methods):
@@ -74,11 +68,12 @@ def by_figures(results: Results) -> Picture:
         named = f"{block.metric.title.lower()}, {block.metric.unit}"
         _label(axes, "K, figures of the pattern", named)
     legend(figure)
+    names = [method.name for method in results.methods]
     how = f"penalty {'in traffic' if results.overall[1].traffic else 'alone on the road'}"
     return Picture(
         "by-figures",
-        f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}: means over the "
-        f"scenarios that each has{intervals_over(fewest)}.",
+        f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}. "
+        f"{averaged([cases_of(results, block, names, compared=False) for block in results.overall], compared=False)}",
         figure,
     )
 

@@ -55,8 +55,8 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     methods = [job.method for job in jobs.values()]
     results = results_of(rows, methods, plan.reference, weathers, planned, plan.jobs)
     kept, again = (None, "") if transfer is None else _of_these_jobs(transfer, results)
-    shared = kept is not None and len(kept) > 0 and len(shared_drives(kept)) > 0
-    driven = [(kept, metric) for metric in (DEVIATION, PENALTY)] if kept is not None and shared else []
+    unshared = kept is not None and not kept.empty and shared_drives(kept).empty
+    driven = [] if kept is None or kept.empty or unshared else [(kept, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
     shown = (*drawn, gallery(results, jobs), *passages(results, jobs), *(transfer_map(*each) for each in driven))
     pictures = [picture for picture in shown if picture is not None]
@@ -69,7 +69,7 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     for table in tables:
         write_text(out / f"{table.name}.tex", in_latex(table))
     name, sentence = folder.resolve().name, _sentence(results, jobs.values())
-    if kept is not None and len(kept) and not shared:
+    if unshared:
         sentence += " The transfer is left out: none of its patterns was driven over by every controller."
     write_text(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
     write_text(out / "tables.html", _page(name, sentence, results, tables, pictures, out))

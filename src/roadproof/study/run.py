@@ -114,10 +114,10 @@ def _ray_at(cluster: str | None) -> Generator[Any]:
     if ray.is_initialized():
         yield ray
         return
-    _require_listening(cluster)
     try:
+        _require_listening(cluster)
         ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
     try:
         yield ray
@@ -126,13 +126,14 @@ def _ray_at(cluster: str | None) -> Generator[Any]:
 
 
 def _require_listening(cluster: str) -> None:
-    """See that somebody listens at an address with a port; Ray itself would ask there for minutes."""
-    try:
-        address = urlsplit(cluster if "//" in cluster else f"//{cluster}")
-        if address.hostname is not None and address.port is not None:
-            socket.create_connection((address.hostname, address.port), timeout=_ANSWERS_S).close()
-    except (OSError, ValueError) as error:
-        raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
+    """See that somebody listens at an address with a port; Ray itself would ask there for minutes.
+
+    Raises:
+        OSError, ValueError: nobody does, or the port is none.
+    """
+    address = urlsplit(cluster if "//" in cluster else f"//{cluster}")
+    if address.hostname is not None and address.port is not None:
+        socket.create_connection((address.hostname, address.port), timeout=_ANSWERS_S).close()
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:

@@ -32,19 +32,23 @@ def table_note(
         f"{block.metric.title} in {block.metric.unit}, {'in traffic' if block.traffic else 'alone on the road'}"
         for block in blocks
     )
-    cases = [_cases(results, block, methods, compared=compared) for block in blocks]
-    told = [_averaged(cases, compared=compared), said, *_bare_road(blocks, cases), *missing(results, blocks, methods)]
+    cases = [cases_of(results, block, methods, compared=compared) for block in blocks]
+    told = [averaged(cases, compared=compared), said, *_bare_road(blocks, cases), *missing(results, blocks, methods)]
     return " ".join([f"{'; '.join(measured)}; all of it driven.", *told])
 
 
-def _cases(results: Results, block: Block, methods: Sequence[str], *, compared: bool) -> Frame:
-    """The cases that a block's means are over: the penalty of each on the bare road, a column a method."""
+def cases_of(results: Results, block: Block, methods: Sequence[str], *, compared: bool) -> Frame:
+    """The cases that a block's means are over: the penalty of each on the bare road, a column a method.
+
+    Where the methods are compared only the cases that all of them have.
+    """
     drives = results.drives_of(block, methods)
     cases = drives.pivot_table("clean_points", ["scenario", "seed", "figures"], "method").reindex(columns=list(methods))
     return cases.dropna() if compared else cases
 
 
-def _averaged(cases: Sequence[Frame], *, compared: bool) -> str:
+def averaged(cases: Sequence[Frame], *, compared: bool) -> str:
+    """What the means of blocks are over, by the cases of each (`cases_of`), in a sentence."""
     # A number is of one K, and where methods are not compared of one method.
     columns = [[each] if compared else [each[method].dropna() for method in each] for each in cases]
     held = [one.reset_index() for each in columns for one in each if len(one)]
