@@ -10,7 +10,7 @@ from roadproof.datatypes import Command, Control, Ending, Observation, VehicleSt
 from roadproof.drives import SteeringNoise
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, swerving
 from roadproof.driving.episode import Episode
-from roadproof.errors import RecordingError
+from roadproof.errors import CanvasNotReachedError
 from roadproof.recordings import Side
 
 DT_S, SPEED_MPS = 0.05, 7.0
@@ -92,7 +92,9 @@ def test_offsets_begin_at_zero_with_the_view_and_differ_by_seed():
 
 @pytest.mark.parametrize("side", [Side.RIGHT, Side.RANDOM])
 def test_nothing_swerves_over_a_canvas_that_is_seen_from_one_place(side):
-    with pytest.raises(RecordingError, match=r"the clean drive goes 0\.00 m .* expected 1 m or more to swerve over"):
+    with pytest.raises(
+        CanvasNotReachedError, match=r"the clean drive goes 0\.00 m .* expected 1 m or more to swerve over"
+    ):
         offsets(side, 1.5, 10.0, 10.0, 60.0, np.random.default_rng(0))
 
 
@@ -150,5 +152,5 @@ def test_noise_goes_on_top_of_the_clean_controls_while_the_policy_only_answers()
 def test_a_car_that_stands_still_has_no_path():
     clean = episode(*drive(bend, 0.3))
     still = dataclasses.replace(clean, x_m=clean.x_m * 0, y_m=clean.y_m * 0)
-    with pytest.raises(RecordingError, match="hardly moves in round"):
+    with pytest.raises(CanvasNotReachedError, match="hardly moves in round"):
         CleanPath.of(still)

@@ -26,6 +26,7 @@ from roadproof.gate.stretch import Stretch, known_paints
 from roadproof.gate.verdict import Kind, Status
 from roadproof.paint import PaintLimits
 from roadproof.paint.site import LaneMark, Site
+from roadproof.patterns import raster
 from team_folder import PLAN, MagentaShy, magenta_shy
 
 CHANGE = '[change]\nreference = "reference"\ndeviation_m = { absolute = 0.1, relative = 0.2 }\n'
@@ -385,6 +386,26 @@ def test_a_reference_with_which_nothing_could_be_compared_is_refused(accepted, t
     with pytest.raises(CheckError, match=message):
         run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
     assert not (tmp_path / "out" / "drives").exists()
+
+
+def test_a_machine_that_rounds_otherwise_keeps_the_reference(accepted, team, tmp_path, monkeypatch):
+    def rounded_otherwise(pattern):
+        paint = raster(pattern)
+        paint[0, 0, :3] ^= 1
+        return paint
+
+    text = (team / "change.toml").read_text().replace("random = 0", "random = 3")
+    (team / "both.toml").write_text(text.replace("[limits]", "[limits]\nrandom = { left_lane = 1.0 }"))
+    plan = load_check(team / "both.toml", trust=True)
+    assert run_check(plan, MagentaShy(gain=0.5), tmp_path, compare=False).status is Status.PASSED
+    plan = replace(plan, reference=tmp_path / "check.json")
+    monkeypatch.setattr("roadproof.gate.check.raster", rounded_otherwise)
+    assert run_check(plan, MagentaShy(gain=0.5), tmp_path / "out").status is Status.PASSED
+    ((name, (stored, *others)),) = plan.stored.items()
+    moved = replace(stored, pattern=stored.pattern.mapped(lambda values: values * 0.999))
+    for other in (replace(plan, random=4), replace(plan, stored={name: (moved, *others)})):
+        with pytest.raises(CheckError, match="other patterns, starts, seeds or recordings"):
+            run_check(other, MagentaShy(gain=0.5), tmp_path / "out")
 
 
 def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):

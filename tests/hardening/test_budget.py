@@ -108,3 +108,8 @@ def test_budgets_that_make_no_sense_are_refused():
         HardeningBudget(attack=dataclasses.replace(QUICK, objective=SteeringShift()))
     with pytest.raises(TrainingError, match="-1 drives through the town"):
         HardeningBudget(town_drives=-1)
+    with pytest.raises(TrainingError, match="unseen is gradopt, by which training attacks"):
+        HardeningBudget(unseen=HardeningBudget().attack.method)
+    for family in ("free", "published"):
+        with pytest.raises(TrainingError, match="rectangles are painted in training"):
+            HardeningBudget(unseen_shape=Shape.RECTANGLE).require_unseen(SearchSpace(figures=5, family=family))

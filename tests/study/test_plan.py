@@ -275,6 +275,11 @@ ASIDE = "[starts]\nturned_rad = 0.0\nfaster_mps = 0.0\nright_m = "
         ("[traffic]", "[starts]\nright_m = 1.0\nturned_rad = 0.3\n\n[traffic]", "starts of left-01 reach 1 m to the"),
         ("[traffic]", "[paint]\nkeep_out_m = 10.0\n\n[traffic]", r"\[paint\] on left-01: a keep-out of 10 m"),
         ("[traffic]", '[paint]\ncolours = ["#ff8000"]\n\n[traffic]', "the limits on colour leave no black"),
+        (
+            "[traffic]",
+            "[paint]\ncontrast = [0.0, 0.3]\n\n[traffic]",
+            "paint.contrast needs .* asphalt for method BO, which",
+        ),
         ("[traffic]", f"{ASIDE}0.0\n\n[traffic]", "starts has the scenario's own among those drawn"),
         ("[traffic]", f"{ASIDE}0.00001\n\n[traffic]", "starts has the scenario's own among those drawn"),
     ],
@@ -292,6 +297,13 @@ def test_colours_that_the_published_baseline_had_not_leave_it_no_paint(tmp_path)
         load_study(written(tmp_path, white))
     alone = white[: white.index('[[method]]\nname = "BO"')]
     assert len(load_study(written(tmp_path, alone)).methods) == 1
+
+
+def test_a_contrast_is_kept_to_where_the_asphalt_is_measured_or_given(tmp_path):
+    paint = "[paint]\ncontrast = [0.0, 0.6]\n"
+    coloured = TEXT.replace('"1-b", ', "").replace("[traffic]", f"{paint}\n[traffic]")
+    assert load_study(written(tmp_path, coloured[: coloured.index('[[method]]\nname = "BO"')])).paint is not None
+    assert load_study(written(tmp_path, coloured.replace(paint, f'{paint}asphalt = "#5a5a5b"\n'))).paint is not None
 
 
 def test_a_study_that_is_not_there_is_named(tmp_path):

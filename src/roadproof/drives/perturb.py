@@ -25,7 +25,7 @@ from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives.trajectories import SteeringNoise
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Policy
-from roadproof.errors import RecordingError
+from roadproof.errors import CanvasNotReachedError
 from roadproof.recordings import Side
 
 _GAIN_PRIOR = 0.3
@@ -61,12 +61,12 @@ class CleanPath:
         """The path of a clean episode.
 
         Raises:
-            RecordingError: the car did not move.
+            CanvasNotReachedError: the car did not move.
         """
         moved = np.hypot(np.diff(episode.x_m), np.diff(episode.y_m))
         on = np.flatnonzero(moved > 1e-3)
         if on.size < 2:
-            raise RecordingError(f"the car hardly moves in {episode.scenario}; check the driver")
+            raise CanvasNotReachedError(f"the car hardly moves in {episode.scenario}; check the driver")
         heading = np.unwrap(episode.yaw_rad)
         turned, steer = np.diff(heading)[on] / moved[on], episode.steer[on]
         gain = (_GAIN_PRIOR_WEIGHT * _GAIN_PRIOR - steer @ turned) / (_GAIN_PRIOR_WEIGHT + steer @ steer)
@@ -138,10 +138,10 @@ def offsets(
         weaves: whether the offset weaves from side to side, to the named side first.
 
     Raises:
-        RecordingError: the car hardly moves while the canvas is in view.
+        CanvasNotReachedError: the car hardly moves while the canvas is in view.
     """
     if to_m - from_m < _LEAST_M:
-        raise RecordingError(
+        raise CanvasNotReachedError(
             f"the clean drive goes {to_m - from_m:.2f} m from the first to the last of its frames that show the "
             f"canvas, expected {_LEAST_M:g} m or more to swerve over; keep more frames, or check the driver"
         )

@@ -53,7 +53,7 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
 
 
 def command_of(plan: CheckPlan, place: Place, weather: Weather, pattern: str, seed: int, out: Path) -> str:
-    """The command that drives over a pattern, and past the bare road, from the starts of one seed, and films it."""
+    """The command to drive over a pattern, and the bare road, from the starts of one seed, and to film the first."""
     words = ["roadproof", "evaluate", pattern, "--controller", plan.controller, "--simulator", place.where]
     if plan.budget == "full":
         words += ["--scenario", place.scenario.name, "--weathers", weather, "--runs", "0"]

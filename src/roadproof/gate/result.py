@@ -62,7 +62,8 @@ class Case:
         measures: the case's measures, each with its interval.
         status: whether the case passes.
         reasons: why the case does not pass; empty where it does.
-        command: the command that drives the worst of the drives again and films it.
+        command: the command to drive over the paint of the worst drive again, from all starts of its seed, and to film
+            the first.
         drives: all drives that were judged.
     """
 

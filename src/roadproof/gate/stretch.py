@@ -159,15 +159,18 @@ class Stretch:
         """A hash of all that the drives of a case depend on, apart from the controller.
 
         A fresh attack finds another pattern for every controller, so only how it searches counts, and in which weather.
+        Stored patterns are known by their figures and random ones by what draws them: other machines round otherwise.
         """
         plan, (_, weather, kind, _) = self.plan, key
-        images = [] if kind is Kind.FRESH else [self.episodes.digests[paint.name] for paint in paints]
+        stored = [_figures(paint.pattern) for paint in paints if paint.kind is Kind.STORED]
+        drawn = [plan.random] if kind is Kind.RANDOM else []
         world = world_of(self.world) or type(self.world).__qualname__
         told = [
             identity(self.episodes.scenario),
             weather,
             kind,
-            images,
+            stored,
+            drawn,
             plan.figures,
             *([plan.paint] if plan.paint else []),
             *([plan.variation] if plan.variation and kind is Kind.FRESH else []),
@@ -202,6 +205,10 @@ def _fault(episode: Episode, aside_m: float | None) -> str:
     if aside_m is not None and abs(aside_m) >= LEAVES_LANE_M:
         told.append(f"{abs(aside_m):.2f} m to the {'left' if aside_m > 0 else 'right'} of the recorded drive")
     return ", ".join(told)
+
+
+def _figures(pattern: Pattern) -> list[object]:
+    return [pattern.shapes, pattern.boxes.tolist(), pattern.colours.tolist()]
 
 
 def measures_of(kind: Kind, drives: Sequence[JudgedDrive]) -> Measures:

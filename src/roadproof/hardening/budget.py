@@ -40,8 +40,8 @@ class HardeningBudget:
         clean_weathers: the weathers in which drives over the bare road are counted.
 
     Raises:
-        TrainingError: an attack does not drive in the recorded world, a number of drives is below 0, or no weather is
-            given for drives over the bare road.
+        TrainingError: an attack does not drive in the recorded world, training attacks by the method that is to be
+            unseen, a number of drives is below 0, or no weather is given for drives over the bare road.
     """
 
     attack: Budget = field(default_factory=lambda: replace(ALONE, method=GradOpt(restarts=1)))
@@ -55,6 +55,10 @@ class HardeningBudget:
     def __post_init__(self) -> None:
         if not (self.attack.is_predicted and self.judge.is_predicted):
             raise TrainingError("hardening searches in the recorded world; give attack and judge a path deviation")
+        if self.unseen == self.attack.method:
+            raise TrainingError(
+                f"unseen is {self.unseen.word}, by which training attacks; give another method or budget"
+            )
         if not is_whole(self.town_drives) or self.town_drives < 0 or not self.clean_weathers:
             raise TrainingError(
                 f"{self.town_drives!r:.40} drives through the town, {len(self.clean_weathers)} weathers of clean "
@@ -83,12 +87,17 @@ class HardeningBudget:
         )
         return replace(self, attack=attack, judge=judge)
 
-    def require_libraries(self, space: SearchSpace) -> None:
-        """See that what judging needs is installed.
+    def require_unseen(self, space: SearchSpace) -> None:
+        """See that judging can attack as training does not.
 
         Raises:
+            TrainingError: training paints the shape that is to be unseen.
             RoadproofError: the library of the black-box method is not installed.
         """
+        if space.shape is self.unseen_shape:
+            raise TrainingError(
+                f"{space.shape}s are painted in training, so none are unseen in judging; give another unseen_shape"
+            )
         if isinstance(self.unseen, BlackBox):
             self.unseen.proposer(space, 0)
 

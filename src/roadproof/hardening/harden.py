@@ -102,7 +102,7 @@ def harden(
     check_seed(seed, "seed", TrainingError)
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
-        budget.require_libraries(space)
+        budget.require_unseen(space)
     require_opened(processes, factory)
     streets = (*scenarios, *judge_on)
     budget.attack.method.check_space(space)

@@ -27,6 +27,7 @@ from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
 from roadproof.io.identity import stated
 from roadproof.io.known import known_by
+from roadproof.io.text import count_of
 from roadproof.machine import give_back_freed_memory
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stages import recordings_of
@@ -260,7 +261,8 @@ def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
 
 def _save(network: nn.Module, plan: HardeningPlan, number: int) -> None:
     path = plan.weights(number)
-    origin = f"{plan.spec}, hardened for {number} rounds on {', '.join(each.name for each in plan.scenarios)}"
+    rounds = count_of(number, "round")
+    origin = f"{plan.spec}, hardened for {rounds} on {', '.join(each.name for each in plan.scenarios)}"
     if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(plan.spec):
         save_controller(network, path, dtype="float16", origin=origin)
         return

@@ -202,6 +202,13 @@ class Study(Conditions):
             SearchSpace(figures=1, family=family, colour=colour, limits=self.paint)
             for family, colour in product(families, colours)
         ]
+        if self.paint.contrast and self.paint.asphalt is None:
+            for method in self.methods:
+                if isinstance(method, BlackBoxPlan) and method.where == "simulator":
+                    raise StudyError(
+                        f"paint.contrast needs the colour of the asphalt for method {method.name}, which drives in the "
+                        'simulator, where none is measured; add asphalt, such as "#5a5a5b", to [paint], or leave it out'
+                    )
         for scenario in self.scenarios:
             # The marks of other maps are known when their simulator is open.
             known = site_at(_OwnMaps(), scenario) if self._in_town else replace(site_at(None, scenario), marks=())
