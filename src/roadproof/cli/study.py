@@ -73,7 +73,7 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
 
     from roadproof.machine import threads
     from roadproof.pipeline.workload import Workload, of_drives, of_finding, of_proposals, of_recording
-    from roadproof.study.methods import BlackBoxPlan, budget_of
+    from roadproof.study.methods import budget_of, tries_by_driving
     from roadproof.study.shared import recorded_by
 
     traffic, weathers = study.traffic, len(study.weathers)
@@ -83,7 +83,7 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
     for method in study.methods:
         own += judging
         budget = budget_of(method, study.weathers[0], study.variation)
-        if isinstance(method, BlackBoxPlan) and method.where == "simulator":
+        if tries_by_driving(method):
             own += of_drives(method.calls + 1) + of_proposals(budget.method)
         else:
             # Jobs side by side share out the cores.

@@ -293,8 +293,7 @@ def _check_drives(plan: CheckPlan) -> None:
 
 def _check_asphalt(plan: CheckPlan) -> None:
     """See that random patterns in a simulator, where nothing is measured before they are driven, can keep to limits."""
-    paint = plan.paint
-    if plan.budget == "full" and plan.random and paint and paint.contrast and paint.asphalt is None:
+    if plan.budget == "full" and plan.random and plan.paint and plan.paint.lacks_asphalt:
         raise CheckError(
             "paint.contrast needs the colour of the asphalt for random patterns in a full check, where none is "
             'measured; add asphalt, such as "#5a5a5b", to [paint], or random = 0'

@@ -91,6 +91,11 @@ class PaintLimits:
             rgb_of(colour)
 
     @property
+    def lacks_asphalt(self) -> bool:
+        """Whether contrast is limited, but to an asphalt whose colour is still to be measured."""
+        return self.contrast is not None and self.asphalt is None
+
+    @property
     def relaxed(self) -> Mapping[str, PaintLimits]:
         """These limits without one of them, by its name in `LIMITS`, and where there are several without `ANY`."""
         usual = {each.name: each.default for each in fields(self)}

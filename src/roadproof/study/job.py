@@ -34,7 +34,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import History, Progress
-from roadproof.study.methods import BlackBoxPlan, black_box, budget_of, family_of
+from roadproof.study.methods import BlackBoxPlan, black_box, budget_of, family_of, tries_by_driving
 from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job, TrafficPlan, weights_digest
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
@@ -73,7 +73,7 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
         require_on_road(job.starts.range, job.scenario, world)
-        drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
+        drives = tries_by_driving(job.method)
         bare = bare_drives(job, world, controller, scratch.parent)
         for name, *_ in _conditions(job):
             bring_bare_drives(bare, scratch / name)

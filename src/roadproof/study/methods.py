@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import Annotated, Any, Literal, TypeAlias, TypeGuard, cast
 
 import msgspec
 
@@ -113,6 +113,11 @@ class BlackBoxPlan:
 
 
 MethodPlan: TypeAlias = GradOptPlan | PublishedPlan | BlackBoxPlan
+
+
+def tries_by_driving(method: MethodPlan) -> TypeGuard[BlackBoxPlan]:
+    """Whether a method drives over each of its patterns in the simulator, where nothing is recorded or measured."""
+    return isinstance(method, BlackBoxPlan) and method.where == "simulator"
 
 
 def family_of(method: MethodPlan) -> Family:

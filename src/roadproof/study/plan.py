@@ -26,7 +26,14 @@ from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
 from roadproof.search_space import Family, SearchSpace
 from roadproof.simulators.loading import TOWNS, check_spec
-from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, family_of, method_plan
+from roadproof.study.methods import (
+    BlackBoxPlan,
+    MethodPlan,
+    PublishedPlan,
+    family_of,
+    method_plan,
+    tries_by_driving,
+)
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -189,11 +196,15 @@ class Study(Conditions):
     def _check_paint(self) -> None:
         """See that every method can keep to the limits on paint and the variation."""
         for method in self.methods:
-            driven = isinstance(method, BlackBoxPlan) and method.where == "simulator"
             if isinstance(method, PublishedPlan) and (self.paint or self.variation):
                 raise StudyError(f"method {method.name} is as published, without [paint] and [variation]; leave it out")
-            if driven and self.variation:
+            if tries_by_driving(method) and self.variation:
                 raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
+            if tries_by_driving(method) and self.paint and self.paint.lacks_asphalt:
+                raise StudyError(
+                    f"paint.contrast needs the colour of the asphalt for method {method.name}, which drives in the "
+                    'simulator, where none is measured; add asphalt, such as "#5a5a5b", to [paint], or leave it out'
+                )
         if self.paint is None:
             return
         families: dict[Family, None] = dict.fromkeys(family_of(method) for method in self.methods)
@@ -202,13 +213,6 @@ class Study(Conditions):
             SearchSpace(figures=1, family=family, colour=colour, limits=self.paint)
             for family, colour in product(families, colours)
         ]
-        if self.paint.contrast and self.paint.asphalt is None:
-            for method in self.methods:
-                if isinstance(method, BlackBoxPlan) and method.where == "simulator":
-                    raise StudyError(
-                        f"paint.contrast needs the colour of the asphalt for method {method.name}, which drives in the "
-                        'simulator, where none is measured; add asphalt, such as "#5a5a5b", to [paint], or leave it out'
-                    )
         for scenario in self.scenarios:
             # The marks of other maps are known when their simulator is open.
             known = site_at(_OwnMaps(), scenario) if self._in_town else replace(site_at(None, scenario), marks=())
